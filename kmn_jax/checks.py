@@ -1,0 +1,89 @@
+"""Checks at the Python edge: one clear error that names the argument, what is wrong and what to do.
+
+Every public function that takes a user's arrays calls these first. Shapes and dtypes are checked always;
+values only outside of a trace, since a traced array has none (inside jit, failure is data: see PoseResult).
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+
+class InputError(ValueError):
+    """The caller's input cannot be used. The message is one sentence for people."""
+
+
+def is_traced(value: object) -> bool:
+    """Tell whether `value` is an abstract value inside jit, vmap or grad."""
+    return isinstance(value, jax.core.Tracer)
+
+
+def float_array(
+    value: ArrayLike,
+    name: str,
+    shape: tuple[int | None, ...],
+    *,
+    mask: jax.Array | None = None,
+) -> jax.Array:
+    """Return `value` as a floating JAX array of `shape` (None = any length), or raise InputError.
+
+    Rows where `mask` is false are padding and may hold anything. Float64 becomes the default float type.
+    """
+    array = _array(value, name, shape)
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        raise InputError(f"{name} has dtype {array.dtype}, but must be floating point: convert it to float32")
+    if not is_traced(array) and not is_traced(mask):
+        finite = np.isfinite(np.asarray(array, dtype=np.float32))
+        if mask is not None:
+            finite = finite | ~np.asarray(mask).reshape(mask.shape + (1,) * (finite.ndim - mask.ndim))
+        if not finite.all():
+            row = np.argwhere(~finite)[0]
+            raise InputError(
+                f"{name} holds {int((~finite).sum())} values that are NaN, infinite or beyond float32,"
+                f" the first at index {tuple(int(i) for i in row)}: remove such points first"
+            )
+    return array
+
+
+def mask_array(value: ArrayLike | None, name: str, length: int) -> jax.Array:
+    """Return a boolean mask of `length`; None means that every row is real."""
+    if value is None:
+        return jnp.ones(length, dtype=bool)
+    array = _array(value, name, (length,))
+    if array.dtype != jnp.bool_:
+        raise InputError(f"{name} has dtype {array.dtype}, but must be bool (true = real, false = padding)")
+    return array
+
+
+def index_array(value: ArrayLike, name: str, length: int | None, upper: int) -> jax.Array:
+    """Return an integer index array with entries in [0, upper)."""
+    array = _array(value, name, (length,))
+    if not jnp.issubdtype(array.dtype, jnp.integer):
+        raise InputError(f"{name} has dtype {array.dtype}, but must hold integers")
+    if not is_traced(array) and array.size:
+        low, high = int(np.min(array)), int(np.max(array))
+        if low < 0 or high >= upper:
+            raise InputError(f"{name} holds indices from {low} to {high}, outside of [0, {upper})")
+    return array
+
+
+def positive_scalar(value: ArrayLike, name: str) -> jax.Array:
+    """Return a finite float scalar above zero."""
+    array = float_array(jnp.asarray(value, dtype=float) if isinstance(value, int) else value, name, ())
+    if not is_traced(array) and not float(array) > 0:
+        raise InputError(f"{name} is {float(array):g}, but must be above zero")
+    return array
+
+
+def _array(value: ArrayLike, name: str, shape: tuple[int | None, ...]) -> jax.Array:
+    try:
+        array = value if isinstance(value, jax.Array) else jnp.asarray(np.asarray(value))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is not an array of numbers: {error}") from None
+    if array.ndim != len(shape) or any(want not in (None, have) for want, have in zip(shape, array.shape, strict=True)):
+        wanted = ", ".join("any" if want is None else str(want) for want in shape)
+        raise InputError(f"{name} has shape {array.shape}, but must have shape ({wanted})")
+    return array
