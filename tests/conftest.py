@@ -1,0 +1,34 @@
+"""Settings that hold under pytest only: run-time shape checks and no silent promotion."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+install_import_hook("kmn_jax", "beartype.beartype")
+
+# A product of float32 and an accidental float64 or int32 array, or a (n,) added to a (n, 3), is a bug here.
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    has_torch = importlib.util.find_spec("torch") is not None
+    for item in items:
+        if item.get_closest_marker("torch") and not has_torch:
+            item.add_marker(pytest.mark.skip(reason="torch is not installed: run `make bench-env`"))
+        if item.get_closest_marker("gpu") and jax.default_backend() == "cpu":
+            item.add_marker(pytest.mark.skip(reason="no accelerator: run with JAX_PLATFORMS set to it"))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print what passing tests measured and recorded with `record_property`."""
+    for report in terminalreporter.getreports("passed"):
+        for name, value in report.user_properties:
+            terminalreporter.write_line(f"{report.nodeid}: {name} {value}")
