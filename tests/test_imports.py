@@ -31,7 +31,7 @@ OUTER_RANKS = {"configs": 10, "experiments": 11, "benchmarks": 11, "tests": 12}
 ALLOWED = {("benchmarks", "tests.reference")}
 
 # flax.nnx itself loads optax, so optax cannot be on this list.
-HEAVY = ("open3d", "trimesh", "mujoco", "grain", "viser", "torch", "orbax", "scipy.spatial")
+HEAVY = ("open3d", "trimesh", "mujoco", "grain", "viser", "torch", "orbax")
 PUBLIC = {
     "kmn_jax": [],
     "kmn_jax.pose": ["kabsch", "ransac", "icp", "add", "adi", "mssd", "PoseResult"],
