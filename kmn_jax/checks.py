@@ -35,16 +35,15 @@ def float_array(
     array = _array(value, name, shape)
     if not jnp.issubdtype(array.dtype, jnp.floating):
         raise InputError(f"{name} has dtype {array.dtype}, but must be floating point: convert it to float32")
-    if not is_traced(array) and not is_traced(mask):
+    if not is_traced(array) and not is_traced(mask) and not bool(_all_finite(array, mask)):
         finite = np.isfinite(np.asarray(array, dtype=np.float32))
         if mask is not None:
             finite = finite | ~np.asarray(mask).reshape(mask.shape + (1,) * (finite.ndim - mask.ndim))
-        if not finite.all():
-            row = np.argwhere(~finite)[0]
-            raise InputError(
-                f"{name} holds {int((~finite).sum())} values that are NaN, infinite or beyond float32,"
-                f" the first at index {tuple(int(i) for i in row)}: remove such points first"
-            )
+        row = np.argwhere(~finite)[0]
+        raise InputError(
+            f"{name} holds {int((~finite).sum())} values that are NaN, infinite or beyond float32,"
+            f" the first at index {tuple(int(i) for i in row)}: remove such points first"
+        )
     return array
 
 
@@ -76,6 +75,14 @@ def positive_scalar(value: ArrayLike, name: str) -> jax.Array:
     if not is_traced(array) and not float(array) > 0:
         raise InputError(f"{name} is {float(array):g}, but must be above zero")
     return array
+
+
+@jax.jit
+def _all_finite(array: jax.Array, mask: jax.Array | None) -> jax.Array:
+    finite = jnp.isfinite(array)
+    if mask is not None:
+        finite = finite | ~mask.reshape(mask.shape + (1,) * (finite.ndim - mask.ndim))
+    return finite.all()
 
 
 def _array(value: ArrayLike, name: str, shape: tuple[int | None, ...]) -> jax.Array:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
+
+_CPU_PARTS = 16  # fewer than about ten ready operations XLA's CPU runtime keeps on one thread
 
 
 def squared_distances(queries: Float[Array, "n c"], points: Float[Array, "m c"]) -> Float[Array, "n m"]:
@@ -33,13 +37,32 @@ def k_nearest(
     """
     if not 1 <= k <= points.shape[0]:
         raise ValueError(f"k = {k} neighbours asked of {points.shape[0]} points: choose k between 1 and their number")
+    values, indices = jax.lax.platform_dependent(
+        queries, points, mask, cpu=partial(_k_smallest_in_parts, k=k), default=partial(_k_smallest, k=k)
+    )
+    # Without the barrier XLA merges this slice into the selection, which then falls back to a full sort.
+    values, indices = jax.lax.optimization_barrier((values, indices))
+    return indices if mask is None else jnp.where(jnp.isfinite(values), indices, indices[:, :1])
+
+
+def _k_smallest(
+    queries: Float[Array, "n c"], points: Float[Array, "m c"], mask: Bool[Array, " m"] | None, k: int
+) -> tuple[Float[Array, "n k"], Int[Array, "n k"]]:
     distances = squared_distances(queries, points)
     if mask is not None:
         distances = jnp.where(mask[None, :], distances, jnp.inf)
-    negated, indices = jax.lax.top_k(-distances, k)
-    if mask is not None:
-        indices = jnp.where(jnp.isfinite(negated), indices, indices[:, :1])
-    return indices
+    values, indices = jax.lax.top_k(-distances, k)
+    return values, indices
+
+
+def _k_smallest_in_parts(
+    queries: Float[Array, "n c"], points: Float[Array, "m c"], mask: Bool[Array, " m"] | None, k: int
+) -> tuple[Float[Array, "n k"], Int[Array, "n k"]]:
+    """The same for CPUs, where one `top_k` runs on one core, but independent ones run side by side."""
+    size = -(-queries.shape[0] // _CPU_PARTS)
+    parts = [_k_smallest(queries[i : i + size], points, mask, k) for i in range(0, queries.shape[0], size)]
+    values, indices = zip(*parts, strict=True)
+    return jnp.concatenate(values), jnp.concatenate(indices)
 
 
 def nearest(

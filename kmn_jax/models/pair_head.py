@@ -1,0 +1,129 @@
+"""The scene-keypoint pair head, separated: no N x K x C tensor is formed.
+
+A layer on the pair [s_n ; o_k] is a_n + b_k. After GroupNorm (statistics from the moments of a and b) the
+pre-activation is u_n + v_k, and max over k of leaky(u_n + v_k) = leaky(u_n + max_k v_k). Only the keypoint
+logits, sum_c w_c leaky(u_nc + v_kc), are truly pairwise; as leaky(z) = 0.6 z + 0.4 |z|, their linear part
+separates too and the rest is reduced over c without being stored.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Bool, Float
+
+from kmn_jax.models.layers import Compute, NormalizedLinear, channel_moments, dropout, leaky_relu, product
+
+PairDropout = Literal["shared", "per_pair"]
+
+# What padded rows get: certain background, and no preference among keypoints.
+_PADDED_SEGMENTATION = (0.0, -1e4)
+
+
+class PairHead(nnx.Module):
+    """[scene ; object] -> 256, max over keypoints, [that ; object] -> 256 -> segmentation and keypoint logits."""
+
+    def __init__(self, scene_width: int, object_width: int, width: int, groups: int, *, rngs: nnx.Rngs) -> None:
+        self.scene_pair = NormalizedLinear(scene_width + object_width, width, groups, rngs=rngs)
+        self.context_pair = NormalizedLinear(width + object_width, width, groups, rngs=rngs)
+        initializer = nnx.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
+        self.segmentation = nnx.Param(initializer(rngs.params(), (width, 2), jnp.float32))
+        self.keypoint = nnx.Param(initializer(rngs.params(), (width, 1), jnp.float32))
+
+    def __call__(
+        self,
+        scene: Float[Array, "n s"],
+        keypoints: Float[Array, "k o"],
+        compute: Compute,
+        mask: Bool[Array, " n"] | None = None,
+        dropout_rate: float = 0.0,
+        pair_dropout: PairDropout = "shared",
+        key: jax.Array | None = None,
+    ) -> tuple[Float[Array, "n 2"], Float[Array, "n k"]]:
+        """Return segmentation logits (class 1 = object) and keypoint logits, in float32.
+
+        With a key, dropout acts after each of the two pair layers; after the second it is one mask per point
+        and channel for all keypoints ("shared"), or one per pair as published ("per_pair").
+        """
+        context_key, pair_key = (None, None) if key is None else jax.random.split(key)
+        u, v = _pair_terms(self.scene_pair, scene, keypoints, compute, mask)
+        context = dropout(leaky_relu(u + v.max(axis=0)), dropout_rate, context_key).astype(scene.dtype)
+        u, v = _pair_terms(self.context_pair, context, keypoints, compute, mask)
+        weights = self.keypoint[...][:, 0]
+        if pair_key is not None and pair_dropout == "per_pair" and dropout_rate > 0:
+            pooled, keypoint_logits = _per_pair(u, v, weights, dropout_rate, pair_key)
+        else:
+            kept = dropout(jnp.ones_like(u), dropout_rate, pair_key)
+            pooled = kept * leaky_relu(u + v.max(axis=0))
+            keypoint_logits = pairwise_leaky_sum(u, v, kept * weights)
+        segmentation_logits = product(pooled, self.segmentation[...], compute).astype(jnp.float32)
+        if mask is not None:
+            segmentation_logits = jnp.where(mask[:, None], segmentation_logits, jnp.array(_PADDED_SEGMENTATION))
+            keypoint_logits = jnp.where(mask[:, None], keypoint_logits, 0)
+        return segmentation_logits, keypoint_logits
+
+
+def _pair_terms(
+    layer: NormalizedLinear,
+    scene: Float[Array, "n s"],
+    keypoints: Float[Array, "k o"],
+    compute: Compute,
+    mask: Bool[Array, " n"] | None,
+) -> tuple[Float[Array, "n c"], Float[Array, "k c"]]:
+    """Return u and v, in float32, such that the normalised pair layer is u_n + v_k before its activation."""
+    kernel = layer.kernel[...]
+    a = product(scene, kernel[: scene.shape[1]], compute)
+    b = product(keypoints, kernel[scene.shape[1] :], compute)
+    affine = layer.affine(channel_moments(a, mask).plus(channel_moments(b)))
+    return affine(a), b.astype(jnp.float32) * affine.scale
+
+
+def pairwise_leaky_sum(
+    u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, "n c"]
+) -> Float[Array, "n k"]:
+    """Return sum over c of weights_nc leaky(u_nc + v_kc), for leak 0.2."""
+    linear = (weights * u).sum(axis=1)[:, None] + jnp.matmul(weights, v.T, precision=jax.lax.Precision.HIGHEST)
+    absolute = jax.lax.platform_dependent(u, v, weights, cpu=pairwise_absolute_scan, default=pairwise_absolute_fused)
+    return 0.6 * linear + 0.4 * absolute
+
+
+def pairwise_absolute_scan(
+    u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, "n c"]
+) -> Float[Array, "n k"]:
+    """Return sum over c of weights_nc |u_nc + v_kc|, one keypoint after the other: what CPUs vectorise best."""
+
+    @jax.checkpoint  # the backward pass recomputes the signs rather than storing n x k x c of them
+    def one(v_k: Float[Array, " c"]) -> Float[Array, " n"]:
+        return (weights * jnp.abs(u + v_k)).sum(axis=1)
+
+    return jax.lax.map(one, v).T
+
+
+def pairwise_absolute_fused(
+    u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, "n c"]
+) -> Float[Array, "n k"]:
+    """Return the same as one reduction, whose operand XLA's accelerator compilers never store."""
+
+    @jax.checkpoint
+    def all_pairs(u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, "n c"]) -> Float[Array, "n k"]:
+        return (weights[:, None, :] * jnp.abs(u[:, None, :] + v[None, :, :])).sum(axis=2)
+
+    return all_pairs(u, v, weights)
+
+
+def _per_pair(
+    u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, " c"], rate: float, key: jax.Array
+) -> tuple[Float[Array, "n c"], Float[Array, "n k"]]:
+    """Return pooled features and keypoint logits under the published dropout of every pair on its own."""
+
+    @jax.checkpoint
+    def one(best: Float[Array, "n c"], inputs: tuple) -> tuple[Float[Array, "n c"], Float[Array, " n"]]:
+        v_k, key_k = inputs
+        activated = dropout(leaky_relu(u + v_k), rate, key_k)
+        return jnp.maximum(best, activated), (activated * weights).sum(axis=1)
+
+    pooled, logits = jax.lax.scan(one, jnp.full_like(u, -jnp.inf), (v, jax.random.split(key, v.shape[0])))
+    return pooled, logits.T

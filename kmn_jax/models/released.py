@@ -1,0 +1,125 @@
+"""The authors' checkpoints (torch state dicts of the published network) to our parameters, and back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import BinaryIO
+
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save
+
+from kmn_jax.checks import InputError
+from kmn_jax.models.keymatchnet import KeyMatchNet, KeyMatchNetConfig, Model
+from kmn_jax.models.torch_file import read_state_dict, write_state_dict
+
+RELEASED_CONFIG = KeyMatchNetConfig(normalization="released", pair_dropout="per_pair")
+
+TORCH_SUFFIXES = (".t7", ".pt", ".pth")
+
+_ENCODER_LAYERS = {
+    1: "edge1.first",
+    2: "edge1.second",
+    3: "edge2.first",
+    4: "edge2.second",
+    5: "edge3.first",
+    6: "embedding",
+    7: "out",
+}
+_LAYERS = {
+    **{f"conv_obj{i}": f"object.{name}" for i, name in _ENCODER_LAYERS.items()},
+    "conv_obj8": "object_out",
+    **{f"conv{i}": f"scene.{name}" for i, name in _ENCODER_LAYERS.items()},
+    "conv8": "head.scene_pair",
+    "conv8r": "head.context_pair",
+}
+_OUTPUTS = {"conv9": "head.segmentation", "conv10": "head.keypoint"}
+_LAYERS_ON_LISTS = ("conv6", "conv7", "conv_obj6", "conv_obj7", "conv_obj8", "conv9")  # Conv1d, all others Conv2d
+
+
+def load_released(path: str | Path, config: KeyMatchNetConfig = RELEASED_CONFIG) -> Model:
+    """Load published weights as the pair (graphdef, parameters).
+
+    Args:
+        path: the authors' state dict: .t7, .pt or .pth (torch's zip format) or .safetensors with the same
+            names. No code of the file is run.
+        config: the sizes that the weights belong to; the published ones unless the authors' code was changed.
+
+    Raises:
+        InputError: unreadable file, missing or unknown names, shapes other than the config's, non-finite values.
+    """
+    tensors = {name.removeprefix("module."): tensor for name, tensor in _read(Path(path)).items()}
+    graphdef, parameters = nnx.split(nnx.eval_shape(lambda: KeyMatchNet(config, rngs=nnx.Rngs(0))))
+    flat = dict(nnx.to_flat_state(parameters))
+    names = _released_names()
+    problems = [f"{name} is missing" for name in names if name not in tensors]
+    problems += [f"{name} is unknown" for name in tensors if name not in names]
+    for name, target in names.items():
+        if name not in tensors:
+            continue
+        wanted = flat[target].shape
+        value = np.asarray(tensors[name], dtype=np.float32)
+        if target[-1] not in ("norm_scale", "norm_bias"):
+            flat_shape = value.shape[:2] if value.ndim >= 2 and set(value.shape[2:]) <= {1} else value.shape
+            value = value.reshape(flat_shape).T
+        if value.shape != wanted:
+            problems.append(f"{name} has shape {tensors[name].shape}, but the network needs {wanted[::-1]}")
+        elif not np.isfinite(value).all():
+            problems.append(f"{name} holds NaN or infinite values")
+        else:
+            flat[target] = flat[target].replace(jnp.asarray(value))
+    if problems:
+        more = f" and {len(problems) - 8} more" if len(problems) > 8 else ""
+        raise InputError(f"{path} does not hold the published network: {'; '.join(problems[:8])}{more}")
+    return Model(graphdef, nnx.from_flat_state(flat))
+
+
+def save_released(model: tuple[nnx.GraphDef, nnx.State], file: BinaryIO, suffix: str) -> None:
+    """Write a model of the published structure under the authors' names.
+
+    Args:
+        model: the pair (graphdef, parameters); raw inputs only, since others have other first layers.
+        file: open for binary writing.
+        suffix: ".t7", ".pt" or ".pth" for a file that `torch.load` reads, ".safetensors" for that format.
+
+    Raises:
+        InputError: a structure that the authors' code does not have, or an unknown suffix.
+    """
+    config = Model(*model).config
+    if config.inputs != "raw" or config.graph != "dynamic":
+        raise InputError("only a model with raw inputs and a dynamic graph can be written in the authors' form")
+    flat = {path: np.asarray(value[...]) for path, value in nnx.to_flat_state(model[1])}
+    tensors = {}
+    for name, target in _released_names().items():
+        value = flat[target]
+        if value.ndim == 2:
+            dims = 1 if name.split(".")[0] in _LAYERS_ON_LISTS else 2
+            value = value.T.reshape(*value.shape[::-1], *(1,) * dims)
+        tensors[name] = np.ascontiguousarray(value, dtype=np.float32)
+    if suffix in TORCH_SUFFIXES:
+        write_state_dict(tensors, file)
+    elif suffix == ".safetensors":
+        file.write(save(tensors))
+    else:
+        raise InputError(f"cannot write {suffix!r} files: use one of {', '.join(TORCH_SUFFIXES)} or .safetensors")
+
+
+def _released_names() -> dict[str, tuple[str, ...]]:
+    names = {}
+    for released, ours in _LAYERS.items():
+        for suffix, leaf in ((".0.weight", "kernel"), (".1.weight", "norm_scale"), (".1.bias", "norm_bias")):
+            names[released + suffix] = (*ours.split("."), leaf)
+    return names | {f"{released}.0.weight": tuple(ours.split(".")) for released, ours in _OUTPUTS.items()}
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    if not path.is_file():
+        raise InputError(f"{path} does not exist or is not a file")
+    if path.suffix == ".safetensors":
+        try:
+            return load_file(path)
+        except (SafetensorError, OSError) as error:
+            raise InputError(f"{path} is not a readable safetensors file: {error}") from None
+    return read_state_dict(path)

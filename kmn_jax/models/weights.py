@@ -1,0 +1,71 @@
+"""Our own model files: safetensors with our parameter names, the config as JSON in the header."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import BinaryIO
+
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from kmn_jax.checks import InputError
+from kmn_jax.models.keymatchnet import KeyMatchNet, KeyMatchNetConfig, Model
+
+_CONFIG_KEY = "kmn_jax.config"
+
+
+def save_model(model: tuple[nnx.GraphDef, nnx.State], file: BinaryIO) -> None:
+    """Write parameters and config to a file open for binary writing."""
+    tensors = {".".join(path): np.ascontiguousarray(value[...]) for path, value in nnx.to_flat_state(model[1])}
+    config = json.dumps(dataclasses.asdict(Model(*model).config))
+    file.write(save(tensors, metadata={_CONFIG_KEY: config}))
+
+
+def is_model_file(path: str | Path) -> bool:
+    """Tell whether the file is one of ours (rather than published weights in safetensors form)."""
+    try:
+        with safe_open(str(path), "np") as file:
+            return _CONFIG_KEY in (file.metadata() or {})
+    except (SafetensorError, OSError):
+        return False
+
+
+def load_model(path: str | Path) -> Model:
+    """Load a model that `save_model` wrote.
+
+    Raises:
+        InputError: missing or damaged file, not one of ours, or a config that this version does not know.
+    """
+    try:
+        with safe_open(str(path), "np") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118: not a mapping
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{path} is not a readable model file: {error}") from None
+    if _CONFIG_KEY not in metadata:
+        raise InputError(f"{path} carries no kmn_jax config: if it holds published weights, use load_released")
+    try:
+        config = KeyMatchNetConfig(**json.loads(metadata[_CONFIG_KEY]))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path} has a config that this version of kmn_jax cannot use: {error}") from None
+    graphdef, parameters = nnx.split(nnx.eval_shape(lambda: KeyMatchNet(config, rngs=nnx.Rngs(0))))
+    flat = dict(nnx.to_flat_state(parameters))
+    wanted = {".".join(target): target for target in flat}
+    problems = [f"{name} is missing" for name in wanted if name not in tensors]
+    problems += [f"{name} is unknown" for name in tensors if name not in wanted]
+    problems += [
+        f"{name} has shape {tensors[name].shape}, but the network needs {flat[target].shape}"
+        for name, target in wanted.items()
+        if name in tensors and tensors[name].shape != flat[target].shape
+    ]
+    if problems:
+        raise InputError(f"{path} does not fit its own config: {'; '.join(problems[:8])}")
+    return Model(
+        graphdef,
+        nnx.from_flat_state({t: flat[t].replace(jnp.asarray(tensors[name])) for name, t in wanted.items()}),
+    )
