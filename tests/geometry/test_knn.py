@@ -1,0 +1,120 @@
+"""Nearest neighbours against float64 distances in NumPy."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kmn_jax.geometry import k_nearest, nearest, squared_distances
+
+SEEDS = range(3)
+jitted = jax.jit(k_nearest, static_argnums=2)
+
+
+def clouds(seed: int, queries: int, points: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return (
+        rng.normal(size=(queries, width)).astype(np.float32),
+        rng.normal(size=(points, width)).astype(np.float32),
+    )
+
+
+def dense_distances(queries: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return ((queries[:, None].astype(np.float64) - points[None].astype(np.float64)) ** 2).sum(-1)
+
+
+@pytest.mark.parametrize("width", [3, 64])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_squared_distances_equal_the_sum_of_squared_differences(seed: int, width: int) -> None:
+    queries, points = clouds(seed, 50, 70, width)
+    # 1e-6 of the largest squared norm: what rounding of the expanded square leaves.
+    tolerance = 1e-6 * max((queries**2).sum(-1).max(), (points**2).sum(-1).max())
+    found = jax.jit(squared_distances)(queries, points)
+    np.testing.assert_allclose(found, dense_distances(queries, points), atol=tolerance)
+
+
+@pytest.mark.parametrize("width", [3, 64])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_k_nearest_are_the_nearest(seed: int, width: int) -> None:
+    queries, points = clouds(seed, 53, 70, width)
+    found = np.asarray(jitted(queries, points, 9))
+    distances = dense_distances(queries, points)
+    assert all(len(set(row)) == 9 for row in found)
+    np.testing.assert_allclose(
+        np.sort(np.take_along_axis(distances, found, 1)), np.sort(distances)[:, :9], atol=1e-6 * distances.max()
+    )
+
+
+def test_k_nearest_eager_equals_jitted() -> None:
+    queries, points = clouds(0, 53, 70, 3)
+    np.testing.assert_array_equal(k_nearest(jnp.asarray(queries), jnp.asarray(points), 9), jitted(queries, points, 9))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_k_nearest_contains_the_point_itself(seed: int) -> None:
+    _, points = clouds(seed, 1, 70, 3)
+    assert (np.asarray(jitted(points, points, 5)) == np.arange(70)[:, None]).any(axis=1).all()
+
+
+def test_ties_go_to_the_lower_index() -> None:
+    points = jnp.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 0]])
+    assert sorted(np.asarray(jitted(jnp.zeros((1, 3)), points, 3))[0].tolist()) == [0, 1, 4]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_padding_is_never_found_whatever_it_holds(seed: int) -> None:
+    queries, points = clouds(seed, 53, 70, 3)
+    mask = np.arange(70) % 3 != 0
+    padded = np.where(mask[:, None], points, np.nan).astype(np.float32)
+    found = np.asarray(jitted(queries, padded, 9, mask))
+    unpadded = np.flatnonzero(mask)[np.asarray(jitted(queries, points[mask], 9))]
+    np.testing.assert_array_equal(np.sort(found), np.sort(unpadded))
+
+
+def test_with_fewer_real_points_than_k_the_nearest_repeats() -> None:
+    queries, points = clouds(0, 53, 70, 3)
+    mask = np.isin(np.arange(70), [4, 31, 60])
+    found = np.asarray(jitted(queries, points, 9, mask))
+    closest = np.argmin(np.where(mask[None], dense_distances(queries, points), np.inf), axis=1)
+    for row, first in zip(found, closest, strict=True):
+        assert sorted(row.tolist()) == sorted([4, 31, 60] + [first] * 6)
+
+
+def test_vmap_equals_a_loop() -> None:
+    points = jax.random.normal(jax.random.key(0), (4, 40, 3))
+    mask = jax.random.bernoulli(jax.random.key(1), 0.7, (4, 40))
+    batched = jax.jit(jax.vmap(lambda p, m: k_nearest(p, p, 5, m)))(points, mask)
+    for i in range(4):
+        np.testing.assert_array_equal(np.sort(batched[i]), np.sort(jitted(points[i], points[i], 5, mask[i])))
+
+
+@pytest.mark.parametrize("k", [0, 4])
+def test_impossible_k_is_refused(k: int) -> None:
+    with pytest.raises(ValueError, match=f"k = {k} neighbours"):
+        k_nearest(jnp.zeros((2, 3)), jnp.zeros((3, 3)), k)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_nearest_is_the_closest_point_and_its_distance(seed: int) -> None:
+    queries, points = clouds(seed, 50, 70, 3)
+    indices, distances = jax.jit(nearest)(queries, points)
+    dense = np.sqrt(dense_distances(queries, points))
+    np.testing.assert_allclose(
+        np.take_along_axis(dense, np.asarray(indices)[:, None], 1)[:, 0], dense.min(1), atol=1e-5
+    )
+    np.testing.assert_allclose(distances, dense.min(1), atol=1e-5)
+
+
+def test_nearest_of_a_coincident_point_is_at_distance_zero() -> None:
+    points = 100 + 10 * jax.random.normal(jax.random.key(0), (30, 3))
+    indices, distances = nearest(points, points)
+    np.testing.assert_array_equal(indices, np.arange(30))
+    np.testing.assert_array_equal(distances, 0)
+
+
+def test_nearest_without_real_points_is_infinitely_far() -> None:
+    indices, distances = nearest(jnp.ones((3, 3)), jnp.full((4, 3), jnp.nan), jnp.zeros(4, dtype=bool))
+    assert np.isposinf(distances).all()
+    assert ((np.asarray(indices) >= 0) & (np.asarray(indices) < 4)).all()
