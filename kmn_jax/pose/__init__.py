@@ -1,0 +1,44 @@
+"""From matches to a pose: alignment, consensus search, refinement and the errors they are judged by.
+
+Three functions share the name of their module (`kabsch`, `ransac`, `icp`): as attributes of this package these
+names are the functions.
+"""
+
+from kmn_jax.pose.icp import IcpConfig, icp
+from kmn_jax.pose.kabsch import kabsch
+from kmn_jax.pose.matches import MatchConfig, Matches, find_matches
+from kmn_jax.pose.metrics import (
+    add,
+    adi,
+    bounding_box_diagonal,
+    diameter,
+    discretise_symmetry,
+    is_correct,
+    mssd,
+    nearest_instance_error,
+    recall,
+)
+from kmn_jax.pose.ransac import RansacConfig, ransac
+from kmn_jax.pose.result import PoseResult, PoseStatus
+
+__all__ = [
+    "IcpConfig",
+    "MatchConfig",
+    "Matches",
+    "PoseResult",
+    "PoseStatus",
+    "RansacConfig",
+    "add",
+    "adi",
+    "bounding_box_diagonal",
+    "diameter",
+    "discretise_symmetry",
+    "find_matches",
+    "icp",
+    "is_correct",
+    "kabsch",
+    "mssd",
+    "nearest_instance_error",
+    "ransac",
+    "recall",
+]

@@ -1,0 +1,186 @@
+"""Pose errors and recall, as the field reports them. All lengths are in the unit of the points.
+
+ADD and ADI: Hinterstoisser et al. 2012; MSSD and discretised symmetries: the BOP challenge's methodology.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from kmn_jax.checks import InputError, float_array, is_traced, mask_array
+from kmn_jax.geometry.se3 import compose, from_quaternion_translation, transform_points
+from kmn_jax.typing import Points, Pose, Scalar
+
+PoseMetric = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
+
+
+def add(T_estimated: ArrayLike, T_true: ArrayLike, points: ArrayLike) -> jax.Array:
+    """Return the mean distance between object points (m, 3) under two poses, for objects without symmetry."""
+    return _add(*_checked(T_estimated, T_true, points))
+
+
+def adi(T_estimated: ArrayLike, T_true: ArrayLike, points: ArrayLike) -> jax.Array:
+    """Return the mean distance from each truly posed point to the nearest estimated one, for any object.
+
+    It forgives symmetries, as each point may meet any other.
+    """
+    return _adi(*_checked(T_estimated, T_true, points))
+
+
+def mssd(
+    T_estimated: ArrayLike, T_true: ArrayLike, points: ArrayLike, symmetries: ArrayLike | None = None
+) -> jax.Array:
+    """Return the largest distance between object points under two poses, at the most favourable symmetry.
+
+    `symmetries` (s, 4, 4) are motions of the object onto itself in its own frame, in the unit of the points
+    (see `discretise_symmetry`); the identity always counts among them.
+    """
+    poses = float_array(
+        np.zeros((0, 4, 4), np.float32) if symmetries is None else symmetries, "symmetries", (None, 4, 4)
+    )
+    return _mssd(*_checked(T_estimated, T_true, points), poses)
+
+
+def discretise_symmetry(axis: ArrayLike, offset: ArrayLike, count: int) -> jax.Array:
+    """Return `count` turns (count, 4, 4) about an axis (3,) of any length through the point `offset` (3,).
+
+    The turns are equally spaced and start with the identity. They stand for a continuous symmetry, or are exactly
+    a discrete one of that order.
+    """
+    axis, offset = float_array(axis, "axis", (3,)), float_array(offset, "offset", (3,))
+    if count < 1:
+        raise InputError(f"count is {count}, but at least one turn is needed")
+    if not is_traced(axis) and not np.any(axis):
+        raise InputError("axis is zero, but must have a direction")
+    return _turns(axis, offset, count)
+
+
+def nearest_instance_error(
+    metric: PoseMetric,
+    T_estimated: ArrayLike,
+    T_true: ArrayLike,
+    points: ArrayLike,
+    mask: ArrayLike | None = None,
+) -> jax.Array:
+    """Return the least error of a pose against several true ones (i, 4, 4), as published results take it.
+
+    `metric` is `add`, `adi` or a function like them. True poses where `mask` (i,) is false are padding; without
+    a single one the error is infinite.
+    """
+    truth = float_array(T_true, "T_true", (None, 4, 4))
+    mask = mask_array(mask, "mask", truth.shape[0])
+    if truth.shape[0] == 0:
+        return jnp.array(jnp.inf)
+    errors = jax.vmap(lambda pose: metric(jnp.asarray(T_estimated), pose, jnp.asarray(points)))(truth)
+    return jnp.where(mask, errors, jnp.inf).min()
+
+
+def bounding_box_diagonal(points: ArrayLike) -> jax.Array:
+    """Return the diagonal of the axis-aligned box around points (m, 3): the object's size as published."""
+    points = _some_points(points)
+    return jnp.sqrt(((points.max(axis=0) - points.min(axis=0)) ** 2).sum())
+
+
+def diameter(points: ArrayLike) -> jax.Array:
+    """Return the largest distance between any two points (m, 3): the object's size as BOP takes it.
+
+    Time grows with the square of m: thin clouds of many thousand points first, or take their convex hull.
+    """
+    return _diameter(_some_points(points))
+
+
+def is_correct(error: ArrayLike, size: ArrayLike, threshold: float = 0.1) -> jax.Array:
+    """Tell for each error whether it is below `threshold` times the size; an error that is NaN is not."""
+    return jnp.asarray(error) < threshold * jnp.asarray(size)
+
+
+def recall(errors: ArrayLike, size: ArrayLike, threshold: float = 0.1) -> jax.Array:
+    """Return the share of errors (n,) below `threshold` times the size, one for all () or one each (n,).
+
+    A pose that was not found counts by an infinite error. Raises InputError without a single error.
+    """
+    if np.ndim(errors) != 1 or np.shape(errors)[0] == 0:
+        raise InputError(f"errors has shape {np.shape(errors)}, but must be a list of at least one")
+    if np.shape(size) not in ((), np.shape(errors)):
+        raise InputError(f"size has shape {np.shape(size)}, but must be one number or have shape {np.shape(errors)}")
+    return is_correct(errors, size, threshold).mean(dtype=jnp.float32)
+
+
+def _checked(T_estimated: ArrayLike, T_true: ArrayLike, points: ArrayLike) -> tuple[jax.Array, jax.Array, jax.Array]:
+    return (
+        float_array(T_estimated, "T_estimated", (4, 4)).astype(jnp.float32),
+        float_array(T_true, "T_true", (4, 4)).astype(jnp.float32),
+        _some_points(points),
+    )
+
+
+def _some_points(points: ArrayLike) -> jax.Array:
+    array = float_array(points, "points", (None, 3)).astype(jnp.float32)
+    if array.shape[0] == 0:
+        raise InputError("points is empty, but at least one point is needed")
+    return array
+
+
+def _distances(difference: Float[Array, "... 3"]) -> Float[Array, "..."]:
+    return jnp.sqrt((difference**2).sum(axis=-1))
+
+
+def _both(T_estimated: Pose, T_true: Pose, points: Points) -> tuple[Points, Points]:
+    """Return the points under both poses, relative to the centre of the true ones so that digits are not lost."""
+    centre = points.mean(axis=0)
+    points = points - centre[None, :]
+    here = transform_points(T_estimated, centre[None, :]) - transform_points(T_true, centre[None, :])
+    turned = jnp.matmul(points, T_estimated[:3, :3].T, precision=jax.lax.Precision.HIGHEST)
+    return turned + here, jnp.matmul(points, T_true[:3, :3].T, precision=jax.lax.Precision.HIGHEST)
+
+
+@jax.jit
+def _add(T_estimated: Pose, T_true: Pose, points: Points) -> Scalar:
+    estimated, true = _both(T_estimated, T_true, points)
+    return _distances(estimated - true).mean()
+
+
+@jax.jit
+def _adi(T_estimated: Pose, T_true: Pose, points: Points) -> Scalar:
+    estimated, true = _both(T_estimated, T_true, points)
+    return jnp.sqrt(_pairwise_squares(true, estimated).min(axis=1)).mean()
+
+
+@jax.jit
+def _mssd(T_estimated: Pose, T_true: Pose, points: Points, symmetries: Float[Array, "s 4 4"]) -> Scalar:
+    symmetries = jnp.concatenate([jnp.eye(4)[None], symmetries.astype(jnp.float32)])
+
+    def largest(symmetry: Pose) -> Scalar:
+        estimated, true = transform_points(T_estimated, points), transform_points(compose(T_true, symmetry), points)
+        return _distances(estimated - true).max()
+
+    return jax.vmap(largest)(symmetries).min()
+
+
+@jax.jit
+def _diameter(points: Points) -> Scalar:
+    return jnp.sqrt(_pairwise_squares(points, points).max())
+
+
+def _pairwise_squares(a: Float[Array, "n 3"], b: Float[Array, "m 3"]) -> Float[Array, "n m"]:
+    """Return exact squared distances coordinate by coordinate: they fuse into a reduction and are never stored."""
+    x, y, z = (a[:, i, None] - b[None, :, i] for i in range(3))
+    return x * x + y * y + z * z
+
+
+def _turns(axis: Float[Array, "3"], offset: Float[Array, "3"], count: int) -> Float[Array, "c 4 4"]:
+    half = jnp.arange(count, dtype=axis.dtype) * (jnp.pi / count)
+    unit = axis / jnp.sqrt((axis**2).sum())
+    quaternions = jnp.concatenate([jnp.cos(half)[:, None], jnp.sin(half)[:, None] * unit[None, :]], axis=1)
+
+    def turn(quaternion: Float[Array, "4"]) -> Pose:
+        about_origin = from_quaternion_translation(quaternion, jnp.zeros(3))
+        return about_origin.at[:3, 3].set(offset - (about_origin[:3, :3] * offset[None, :]).sum(axis=1))
+
+    return jax.vmap(turn)(quaternions)

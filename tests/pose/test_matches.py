@@ -1,0 +1,134 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kmn_jax.checks import InputError
+from kmn_jax.pose import MatchConfig, PoseStatus, find_matches, ransac
+
+N, K = 40, 6
+
+
+def make_case(seed=0, n=N, k=K):
+    keys = jax.random.split(jax.random.key(seed), 6)
+    segmentation, keypoint = jax.random.normal(keys[0], (n, 2)), 2 * jax.random.normal(keys[1], (n, k))
+    clouds = [jax.random.normal(key, (rows, 3)) for key, rows in zip(keys[2:], (n, n, k, k), strict=True)]
+    return segmentation, keypoint, *clouds, 2.0
+
+
+def softmax(logits):
+    scores = np.exp(np.asarray(logits, np.float64))
+    return scores / scores.sum(axis=1, keepdims=True)
+
+
+def reference(case, threshold):
+    """All (point, keypoint, weight) votes in plain NumPy, best first."""
+    segmentation, keypoint = softmax(case[0]), softmax(case[1])
+    votes = keypoint >= threshold * keypoint.max(axis=1, keepdims=True)
+    votes &= (segmentation[:, 1] > segmentation[:, 0])[:, None]
+    found = [(i, j, segmentation[i, 1] * keypoint[i, j]) for i, j in np.argwhere(votes)]
+    return sorted(found, key=lambda vote: -vote[2])
+
+
+@pytest.mark.parametrize("threshold", [0.1, 0.7, 1.0])
+@pytest.mark.parametrize("seed", range(2))
+def test_against_numpy(seed, threshold):
+    case = make_case(seed)
+    matches = find_matches(*case, config=MatchConfig(vote_threshold=threshold, capacity=300))
+    expected = reference(case, threshold)
+    assert matches.mask.sum() == len(expected)
+    assert not matches.overflow
+    assert matches.mask.shape == (300,)
+    for row, (i, j, weight) in enumerate(expected):
+        np.testing.assert_allclose(matches.weights[row], weight, rtol=1e-5)
+        np.testing.assert_array_equal(matches.scene_points[row], case[2][i])
+        np.testing.assert_array_equal(matches.scene_normals[row], case[3][i])
+        np.testing.assert_array_equal(matches.object_points[row], case[4][j])
+        np.testing.assert_array_equal(matches.object_normals[row], case[5][j])
+    assert not matches.weights[len(expected) :].any()
+
+
+def test_overflow_keeps_the_best():
+    case = make_case()
+    expected = reference(case, 0.1)
+    matches = find_matches(*case, config=MatchConfig(vote_threshold=0.1, capacity=10))
+    assert matches.overflow
+    assert matches.mask.all()
+    np.testing.assert_allclose(matches.weights, [weight for *_, weight in expected[:10]], rtol=1e-5)
+
+
+def test_large_logits_do_not_overflow():
+    case = make_case()
+    matches = find_matches(case[0] * 1e4, case[1] * 1e4, *case[2:])
+    assert matches.mask.any()
+    for field in matches:
+        assert np.isfinite(field).all()
+
+
+def test_nothing_segmented_gives_no_pose():
+    case = make_case()
+    matches = find_matches(jnp.tile(jnp.array([[3.0, -3.0]]), (N, 1)), *case[1:])
+    assert not matches.mask.any()
+    result = ransac(jax.random.key(0), matches)
+    assert result.status == PoseStatus.TOO_FEW_MATCHES
+    np.testing.assert_array_equal(result.T_scene_object, np.eye(4))
+
+
+def test_masked_points_never_vote():
+    case = make_case()
+    mask = np.arange(N) < 25
+    rubbish = [jnp.where(mask[:, None], array, jnp.nan) for array in case[:4]]
+    matches = find_matches(*rubbish, *case[4:], mask=mask)
+    expected = find_matches(*(array[:25] for array in case[:4]), *case[4:])
+    for name in ("object_points", "scene_points", "weights", "mask"):
+        np.testing.assert_array_equal(getattr(matches, name), getattr(expected, name))
+
+
+def test_traced_points_that_are_not_finite_never_vote():
+    case = list(make_case())
+    case[1] = case[1].at[3, 0].set(jnp.nan)
+    case[2] = case[2].at[5, 0].set(jnp.inf)
+    mask = ~np.isin(np.arange(N), [3, 5])
+    matches = jax.jit(find_matches)(*case)
+    expected = jax.jit(find_matches)(*make_case(), mask)
+    for got, want in zip(matches, expected, strict=True):
+        np.testing.assert_array_equal(got, want)
+    with pytest.raises(InputError, match="keypoint_logits holds"):
+        find_matches(*case)
+
+
+def test_vmap_agrees_with_single_calls():
+    cases = [make_case(seed) for seed in range(3)]
+    batch = jax.vmap(find_matches)(*(jnp.stack([jnp.asarray(x) for x in side]) for side in zip(*cases, strict=True)))
+    for row, case in enumerate(cases):
+        np.testing.assert_allclose(batch.weights[row], find_matches(*case).weights, rtol=1e-5)
+
+
+def test_bad_input_is_named():
+    case = make_case()
+
+    def with_argument(position, value):
+        return [*case[:position], value, *case[position + 1 :]]
+
+    bad = [
+        (0, case[0][:, :1], "segmentation_logits has shape"),
+        (0, case[0].astype(jnp.int32), "segmentation_logits has dtype"),
+        (1, case[1][0], "keypoint_logits has shape"),
+        (1, case[1][:0], "keypoint_logits has shape"),
+        (2, case[2][:5], "scene_points has shape"),
+        (3, case[3][:, :2], "scene_normals has shape"),
+        (4, case[4][:2], "keypoints has shape"),
+        (5, case[5] * jnp.inf, "keypoint_normals holds"),
+        (6, -1.0, "object_diameter is -1"),
+    ]
+    for position, value, message in bad:
+        with pytest.raises(InputError, match=message):
+            find_matches(*with_argument(position, value))
+    with pytest.raises(InputError, match="mask has dtype"):
+        find_matches(*case, mask=np.ones(N, np.int32))
+
+
+@pytest.mark.parametrize("change", [{"vote_threshold": 0.0}, {"vote_threshold": 1.5}, {"capacity": 2}])
+def test_config_refuses_contradictions(change):
+    with pytest.raises(ValueError, match=next(iter(change))):
+        MatchConfig(**change)
