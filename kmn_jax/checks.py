@@ -9,7 +9,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
+
+from kmn_jax.typing import ArrayInput
 
 
 class InputError(ValueError):
@@ -22,7 +23,7 @@ def is_traced(value: object) -> bool:
 
 
 def float_array(
-    value: ArrayLike,
+    value: ArrayInput,
     name: str,
     shape: tuple[int | None, ...],
     *,
@@ -47,7 +48,7 @@ def float_array(
     return array
 
 
-def mask_array(value: ArrayLike | None, name: str, length: int) -> jax.Array:
+def mask_array(value: ArrayInput | None, name: str, length: int) -> jax.Array:
     """Return a boolean mask of `length`; None means that every row is real."""
     if value is None:
         return jnp.ones(length, dtype=bool)
@@ -57,7 +58,7 @@ def mask_array(value: ArrayLike | None, name: str, length: int) -> jax.Array:
     return array
 
 
-def index_array(value: ArrayLike, name: str, length: int | None, upper: int) -> jax.Array:
+def index_array(value: ArrayInput, name: str, length: int | None, upper: int) -> jax.Array:
     """Return an integer index array with entries in [0, upper)."""
     array = _array(value, name, (length,))
     if not jnp.issubdtype(array.dtype, jnp.integer):
@@ -69,7 +70,7 @@ def index_array(value: ArrayLike, name: str, length: int | None, upper: int) -> 
     return array
 
 
-def positive_scalar(value: ArrayLike, name: str) -> jax.Array:
+def positive_scalar(value: ArrayInput, name: str) -> jax.Array:
     """Return a finite float scalar above zero."""
     array = float_array(jnp.asarray(value, dtype=float) if isinstance(value, int) else value, name, ())
     if not is_traced(array) and not float(array) > 0:
@@ -85,7 +86,7 @@ def _all_finite(array: jax.Array, mask: jax.Array | None) -> jax.Array:
     return finite.all()
 
 
-def _array(value: ArrayLike, name: str, shape: tuple[int | None, ...]) -> jax.Array:
+def _array(value: ArrayInput, name: str, shape: tuple[int | None, ...]) -> jax.Array:
     try:
         array = value if isinstance(value, jax.Array) else jnp.asarray(np.asarray(value))
     except (TypeError, ValueError) as error:

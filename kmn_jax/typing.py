@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from jaxtyping import Array, Bool, Float, Int, Key
+from typing import Any, TypeAlias
+
+from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 Points = Float[Array, "n 3"]
 Normals = Float[Array, "n 3"]
@@ -15,4 +17,7 @@ Pose = Float[Array, "4 4"]
 Rotation = Float[Array, "3 3"]
 Quaternion = Float[Array, "4"]
 Scalar = Float[Array, ""]
-PRNGKey = Key[Array, ""] | Int[Array, "2"]
+PRNGKey = Key[Array, ""] | UInt32[Array, "2"]
+
+# What a public function accepts as an array: JAX, NumPy, nested lists. kmn_jax.checks judges it, with its own errors.
+ArrayInput: TypeAlias = Any

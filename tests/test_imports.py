@@ -16,6 +16,7 @@ ROOT = Path(__file__).parent.parent
 RANKS = {
     "typing": 0,
     "checks": 0,
+    "files": 0,
     "geometry": 1,
     "models": 2,
     "pose": 3,

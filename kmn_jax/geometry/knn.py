@@ -29,20 +29,22 @@ def k_nearest(
     k: int,
     mask: Bool[Array, " m"] | None = None,
 ) -> Int[Array, "n k"]:
-    """Return for each query the indices of its k nearest points, in no promised order.
+    """Return for each query the indices of its k nearest points, in no promised order but for repeats.
 
     A query that is itself one of the points finds itself among them. Points where `mask` is false are never
-    found while at least k are real; with fewer real points the list repeats the nearest one, so that a maximum
-    over neighbours stays right. Ties go to the lower index. Raises ValueError if k is not in [1, m].
+    found; with fewer than k real points, the list ends in repeats of the nearest one, so that a maximum over
+    neighbours stays right. Ties go to the lower index. Raises ValueError if k is not in [1, m].
     """
     if not 1 <= k <= points.shape[0]:
         raise ValueError(f"k = {k} neighbours asked of {points.shape[0]} points: choose k between 1 and their number")
+    queries, points = _centered(queries, points, mask)
     values, indices = jax.lax.platform_dependent(
         queries, points, mask, cpu=partial(_k_smallest_in_parts, k=k), default=partial(_k_smallest, k=k)
     )
-    # Without the barrier XLA merges this slice into the selection, which then falls back to a full sort.
+    # Without the barrier XLA merges the slice into the selection, which then falls back to a full sort; with
+    # the values unused, it lets the parts share one buffer for them, and so wait for each other.
     values, indices = jax.lax.optimization_barrier((values, indices))
-    return indices if mask is None else jnp.where(jnp.isfinite(values), indices, indices[:, :1])
+    return jnp.where(jnp.isfinite(values), indices, indices[:, :1])
 
 
 def _k_smallest(
@@ -75,9 +77,22 @@ def nearest(
     The distance is infinite where no point is real. It is taken from the differences themselves, so that
     it is exact near zero, where the expanded square of `squared_distances` is not.
     """
-    distances = squared_distances(queries, points)
+    distances = squared_distances(*_centered(queries, points, mask))
     if mask is not None:
         distances = jnp.where(mask[None, :], distances, jnp.inf)
     indices = jnp.argmin(distances, axis=-1)
     exact = jnp.sqrt(((queries - points[indices]) ** 2).sum(axis=-1))
     return indices, jnp.where(jnp.isfinite(distances.min(axis=-1)), exact, jnp.inf)
+
+
+def _centered(
+    queries: Float[Array, "n c"], points: Float[Array, "m c"], mask: Bool[Array, " m"] | None
+) -> tuple[Float[Array, "n c"], Float[Array, "m c"]]:
+    """Move the (real) points' mean to the origin: the expanded square loses digits with distance from it."""
+    queries, points = queries.astype(jnp.float32), points.astype(jnp.float32)
+    if mask is None:
+        mean = points.mean(axis=0, keepdims=True)
+    else:
+        count = jnp.maximum(mask.sum(), 1).astype(jnp.float32)
+        mean = jnp.where(mask[:, None], points, 0).sum(axis=0, keepdims=True) / count
+    return queries - mean, points - mean

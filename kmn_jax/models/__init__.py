@@ -10,14 +10,26 @@ from kmn_jax.models.keymatchnet import (
     encode_scene,
     match,
 )
+from kmn_jax.models.losses import LossConfig, MatchingLoss, keypoint_labels, matching_loss
+from kmn_jax.models.released import RELEASED_CONFIG, load_released, save_released
+from kmn_jax.models.weights import load_model, save_model
 
 __all__ = [
+    "RELEASED_CONFIG",
     "KeyMatchNet",
     "KeyMatchNetConfig",
+    "LossConfig",
+    "MatchingLoss",
     "Model",
     "ObjectFeatures",
     "create_model",
     "encode_object",
     "encode_scene",
+    "keypoint_labels",
+    "load_model",
+    "load_released",
     "match",
+    "matching_loss",
+    "save_model",
+    "save_released",
 ]

@@ -58,8 +58,8 @@ class EdgeConv(nnx.Module):
             raise ValueError("only a one-layer block separates over the complete graph")
         neighbor_term, center_term = self._terms(features, features, compute)
         affine = self.first.affine(channel_moments(neighbor_term).plus(channel_moments(center_term)))
-        best = (neighbor_term.astype(jnp.float32) * affine.scale).max(axis=0)
-        return leaky_relu(affine(center_term) + best).astype(center_term.dtype)
+        best = (neighbor_term.astype(jnp.float32) * affine.scale[None, :]).max(axis=0)
+        return leaky_relu(affine(center_term) + best[None, :]).astype(center_term.dtype)
 
     def _terms(
         self, features: Float[Array, "m c"], centers: Float[Array, "n c"], compute: Compute

@@ -86,5 +86,5 @@ class Encoder(nnx.Module):
         overall = leaky_relu(activation.max(axis=0)).astype(z.dtype)
         kernel = self.out.kernel[...]
         width = overall.shape[0]
-        z = product(local, kernel[width:], compute) + product(overall, kernel[:width], compute)
+        z = product(local, kernel[width:], compute) + product(overall[None, :], kernel[:width], compute)
         return leaky_relu(self.out.affine(channel_moments(z, mask))(z)).astype(z.dtype)

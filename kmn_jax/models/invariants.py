@@ -55,12 +55,12 @@ def scene_invariants(cloud: Float[Array, "n 6"], mask: Bool[Array, " n"] | None)
     xyz, normals = cloud[:, :3], cloud[:, 3:]
     squared = _dot(xyz, xyz)
     seed = jnp.argmin(squared if mask is None else jnp.where(mask, squared, jnp.inf))
-    seed_normal = normals[seed]
-    features = [_norm(xyz), _dot(normals, xyz), xyz @ seed_normal, normals @ seed_normal]
+    seed_normal = normals[seed][None, :]
+    features = [_norm(xyz), _dot(normals, xyz), _dot(xyz, seed_normal), _dot(normals, seed_normal)]
     return EncoderInputs(xyz, jnp.stack(features, axis=1), normals)
 
 
-def _dot(a: Float[Array, "*rows 3"], b: Float[Array, "*rows 3"]) -> Float[Array, "*rows"]:
+def _dot(a: Float[Array, "... 3"], b: Float[Array, "... 3"]) -> Float[Array, "..."]:
     return (a * b).sum(axis=-1)
 
 

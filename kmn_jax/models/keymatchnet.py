@@ -13,7 +13,6 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from kmn_jax.checks import InputError, float_array, index_array, is_traced, mask_array, positive_scalar
@@ -27,9 +26,10 @@ from kmn_jax.models.invariants import (
     raw_inputs,
     scene_invariants,
 )
-from kmn_jax.models.layers import Compute, NormalizedLinear, dropout, leaky_relu
+from kmn_jax.models.layers import Compute, NormalizedLinear, dropout
 from kmn_jax.models.normalization import metric_object, metric_scene, object_extent, released_object, released_scene
 from kmn_jax.models.pair_head import PairDropout, PairHead
+from kmn_jax.typing import ArrayInput
 
 
 @dataclass(frozen=True)
@@ -73,9 +73,13 @@ class KeyMatchNetConfig:
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout is {self.dropout}, but must be in [0, 1)")
         if self.inputs == "invariant" and self.normalization == "released":
-            raise ValueError('inputs "invariant" need normalization "metric": "released" scales the axes of space unevenly')
+            raise ValueError(
+                'inputs "invariant" need normalization "metric": "released" scales the axes of space unevenly'
+            )
         if self.num_keypoints > self.num_object_points:
-            raise ValueError(f"{self.num_keypoints} keypoints cannot be drawn from {self.num_object_points} object points")
+            raise ValueError(
+                f"{self.num_keypoints} keypoints cannot be drawn from {self.num_object_points} object points"
+            )
 
 
 class Model(NamedTuple):
@@ -175,7 +179,9 @@ class KeyMatchNet(nnx.Module):
     ) -> tuple[Float[Array, "n 2"], Float[Array, "n k"]]:
         """Return segmentation logits (class 1 = the seed's instance) and keypoint logits, in float32."""
         config = self.config
-        return self.head(scene_features, object_features, config.compute, mask, config.dropout, config.pair_dropout, key)
+        return self.head(
+            scene_features, object_features, config.compute, mask, config.dropout, config.pair_dropout, key
+        )
 
     def __call__(
         self,
@@ -199,9 +205,9 @@ def create_model(config: KeyMatchNetConfig, key: jax.Array) -> Model:
 
 def encode_object(
     model: tuple[nnx.GraphDef, nnx.State],
-    object_cloud: ArrayLike,
-    keypoint_indices: ArrayLike,
-    length: ArrayLike | None = None,
+    object_cloud: ArrayInput,
+    keypoint_indices: ArrayInput,
+    length: ArrayInput | None = None,
 ) -> ObjectFeatures:
     """Encode an object once for all scenes.
 
@@ -226,9 +232,9 @@ def encode_object(
 
 def encode_scene(
     model: tuple[nnx.GraphDef, nnx.State],
-    scene_crop: ArrayLike,
-    length: ArrayLike | None = None,
-    mask: ArrayLike | None = None,
+    scene_crop: ArrayInput,
+    length: ArrayInput | None = None,
+    mask: ArrayInput | None = None,
 ) -> Float[Array, "n s"]:
     """Encode a scene crop once for all objects that are encoded with the same length.
 
@@ -262,7 +268,7 @@ def encode_scene(
 
 def match(
     model: tuple[nnx.GraphDef, nnx.State],
-    scene_features: ArrayLike,
+    scene_features: ArrayInput,
     object_features: ObjectFeatures,
 ) -> tuple[Float[Array, "n 2"], Float[Array, "n k"]]:
     """Match an encoded crop with an encoded object.
@@ -280,8 +286,6 @@ def match(
         InputError: shapes that do not belong together or values that are not finite.
     """
     features = float_array(scene_features, "scene_features", (None, None))
-    if not isinstance(object_features, ObjectFeatures):
-        raise InputError("object_features must be what encode_object returns")
     return _match(*model, features, object_features.features)
 
 
@@ -312,18 +316,25 @@ def _encode_scene(
 def _match(
     graphdef: nnx.GraphDef, parameters: nnx.State, scene: Float[Array, "n s"], keypoints: Float[Array, "k o"]
 ) -> tuple[Float[Array, "n 2"], Float[Array, "n k"]]:
+    network = nnx.merge(graphdef, parameters)
+    widths, wanted = (scene.shape[1], keypoints.shape[1]), (network.config.scene_width, network.config.object_width)
+    if widths != wanted:  # shapes are known while tracing
+        raise InputError(
+            f"scene and object features have widths {widths}, but this network's scene_width and object_width are"
+            f" {wanted}: encode both with the same model"
+        )
     mask = (scene != 0).any(axis=1)  # a real row of GroupNorm outputs is never zero in every channel
-    return nnx.merge(graphdef, parameters).match(scene, keypoints, mask)
+    return network.match(scene, keypoints, mask)
 
 
-def _rows(value: ArrayLike, name: str) -> int:
+def _rows(value: ArrayInput, name: str) -> int:
     shape = jnp.shape(value)
     if len(shape) != 2:
         raise InputError(f"{name} has shape {shape}, but must have shape (any, 6)")
     return shape[0]
 
 
-def _cloud(value: ArrayLike, name: str, mask: jax.Array | None = None) -> Float[Array, "n 6"]:
+def _cloud(value: ArrayInput, name: str, mask: jax.Array | None = None) -> Float[Array, "n 6"]:
     cloud = float_array(value, name, (None, 6), mask=mask)
     if cloud.shape[0] == 0:
         raise InputError(f"{name} is empty: at least one point is needed")

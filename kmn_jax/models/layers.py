@@ -51,14 +51,14 @@ class Moments(NamedTuple):
 
 def channel_moments(x: Float[Array, "*rows c"], mask: Bool[Array, "*rows"] | None = None) -> Moments:
     """Return the moments of each channel over all rows, or over those where `mask` is true."""
-    axes = tuple(range(x.ndim - 1))
-    x = x.astype(jnp.float32)
+    rows = x.astype(jnp.float32).reshape(-1, x.shape[-1])
     if mask is None:
-        mean = x.mean(axis=axes)
-        return Moments(mean, ((x - mean) ** 2).mean(axis=axes))
-    count = jnp.maximum(mask.sum(), 1)
-    mean = jnp.where(mask[..., None], x, 0).sum(axis=axes) / count
-    return Moments(mean, jnp.where(mask[..., None], (x - mean) ** 2, 0).sum(axis=axes) / count)
+        mean = rows.mean(axis=0)
+        return Moments(mean, ((rows - mean[None, :]) ** 2).mean(axis=0))
+    real = mask.reshape(-1)[:, None]
+    count = jnp.maximum(mask.sum(), 1).astype(jnp.float32)
+    mean = jnp.where(real, rows, 0).sum(axis=0) / count
+    return Moments(mean, jnp.where(real, (rows - mean[None, :]) ** 2, 0).sum(axis=0) / count)
 
 
 class ChannelAffine(NamedTuple):
@@ -68,7 +68,8 @@ class ChannelAffine(NamedTuple):
     shift: Float[Array, " c"]
 
     def __call__(self, x: Float[Array, "... c"]) -> Float[Array, "... c"]:
-        return x.astype(jnp.float32) * self.scale + self.shift
+        row = (1,) * (x.ndim - 1) + (-1,)
+        return x.astype(jnp.float32) * self.scale.reshape(row) + self.shift.reshape(row)
 
 
 class NormalizedLinear(nnx.Module):

@@ -10,14 +10,14 @@ from kmn_jax.geometry.knn import squared_distances
 
 def object_extent(points: Float[Array, "m 3"]) -> Float[Array, ""]:
     """Return the diameter: the largest distance between two points."""
-    centered = points - points.mean(axis=0)
+    centered = points - points.mean(axis=0)[None, :]
     return jnp.sqrt(squared_distances(centered, centered).max())
 
 
 def metric_object(cloud: Float[Array, "m 6"], length: Float[Array, ""]) -> Float[Array, "m 6"]:
     """Centre the points on their mean and divide them by `length`; unit normals stay as they are."""
     xyz = cloud[:, :3]
-    return jnp.concatenate([(xyz - xyz.mean(axis=0)) / length, cloud[:, 3:]], axis=1)
+    return jnp.concatenate([(xyz - xyz.mean(axis=0)[None, :]) / length, cloud[:, 3:]], axis=1)
 
 
 def metric_scene(crop: Float[Array, "n 6"], length: Float[Array, ""]) -> Float[Array, "n 6"]:
@@ -27,7 +27,7 @@ def metric_scene(crop: Float[Array, "n 6"], length: Float[Array, ""]) -> Float[A
 
 def released_object(cloud: Float[Array, "m 6"]) -> Float[Array, "m 6"]:
     """Subtract the mean of each of the six channels, divide by the deviation over all entries."""
-    centered = cloud - cloud.mean(axis=0)
+    centered = cloud - cloud.mean(axis=0)[None, :]
     return centered / _nonzero(centered.std())
 
 

@@ -50,18 +50,20 @@ class PairHead(nnx.Module):
         """
         context_key, pair_key = (None, None) if key is None else jax.random.split(key)
         u, v = _pair_terms(self.scene_pair, scene, keypoints, compute, mask)
-        context = dropout(leaky_relu(u + v.max(axis=0)), dropout_rate, context_key).astype(scene.dtype)
+        context = dropout(leaky_relu(u + v.max(axis=0)[None, :]), dropout_rate, context_key).astype(scene.dtype)
         u, v = _pair_terms(self.context_pair, context, keypoints, compute, mask)
         weights = self.keypoint[...][:, 0]
         if pair_key is not None and pair_dropout == "per_pair" and dropout_rate > 0:
             pooled, keypoint_logits = _per_pair(u, v, weights, dropout_rate, pair_key)
         else:
             kept = dropout(jnp.ones_like(u), dropout_rate, pair_key)
-            pooled = kept * leaky_relu(u + v.max(axis=0))
-            keypoint_logits = pairwise_leaky_sum(u, v, kept * weights)
+            pooled = kept * leaky_relu(u + v.max(axis=0)[None, :])
+            keypoint_logits = pairwise_leaky_sum(u, v, kept * weights[None, :])
         segmentation_logits = product(pooled, self.segmentation[...], compute).astype(jnp.float32)
         if mask is not None:
-            segmentation_logits = jnp.where(mask[:, None], segmentation_logits, jnp.array(_PADDED_SEGMENTATION))
+            segmentation_logits = jnp.where(
+                mask[:, None], segmentation_logits, jnp.array(_PADDED_SEGMENTATION)[None, :]
+            )
             keypoint_logits = jnp.where(mask[:, None], keypoint_logits, 0)
         return segmentation_logits, keypoint_logits
 
@@ -78,7 +80,7 @@ def _pair_terms(
     a = product(scene, kernel[: scene.shape[1]], compute)
     b = product(keypoints, kernel[scene.shape[1] :], compute)
     affine = layer.affine(channel_moments(a, mask).plus(channel_moments(b)))
-    return affine(a), b.astype(jnp.float32) * affine.scale
+    return affine(a), b.astype(jnp.float32) * affine.scale[None, :]
 
 
 def pairwise_leaky_sum(
@@ -97,7 +99,7 @@ def pairwise_absolute_scan(
 
     @jax.checkpoint  # the backward pass recomputes the signs rather than storing n x k x c of them
     def one(v_k: Float[Array, " c"]) -> Float[Array, " n"]:
-        return (weights * jnp.abs(u + v_k)).sum(axis=1)
+        return (weights * jnp.abs(u + v_k[None, :])).sum(axis=1)
 
     return jax.lax.map(one, v).T
 
@@ -122,8 +124,8 @@ def _per_pair(
     @jax.checkpoint
     def one(best: Float[Array, "n c"], inputs: tuple) -> tuple[Float[Array, "n c"], Float[Array, " n"]]:
         v_k, key_k = inputs
-        activated = dropout(leaky_relu(u + v_k), rate, key_k)
-        return jnp.maximum(best, activated), (activated * weights).sum(axis=1)
+        activated = dropout(leaky_relu(u + v_k[None, :]), rate, key_k)
+        return jnp.maximum(best, activated), (activated * weights[None, :]).sum(axis=1)
 
     pooled, logits = jax.lax.scan(one, jnp.full_like(u, -jnp.inf), (v, jax.random.split(key, v.shape[0])))
     return pooled, logits.T

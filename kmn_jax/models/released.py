@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import BinaryIO
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +11,9 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
 from kmn_jax.checks import InputError
+from kmn_jax.files import write_whole
 from kmn_jax.models.keymatchnet import KeyMatchNet, KeyMatchNetConfig, Model
-from kmn_jax.models.torch_file import read_state_dict, write_state_dict
+from kmn_jax.models.torch_file import read_state_dict, state_dict_bytes
 
 RELEASED_CONFIG = KeyMatchNetConfig(normalization="released", pair_dropout="per_pair")
 
@@ -76,17 +76,19 @@ def load_released(path: str | Path, config: KeyMatchNetConfig = RELEASED_CONFIG)
     return Model(graphdef, nnx.from_flat_state(flat))
 
 
-def save_released(model: tuple[nnx.GraphDef, nnx.State], file: BinaryIO, suffix: str) -> None:
+def save_released(model: tuple[nnx.GraphDef, nnx.State], path: str | Path) -> None:
     """Write a model of the published structure under the authors' names.
 
     Args:
-        model: the pair (graphdef, parameters); raw inputs only, since others have other first layers.
-        file: open for binary writing.
-        suffix: ".t7", ".pt" or ".pth" for a file that `torch.load` reads, ".safetensors" for that format.
+        model: the pair (graphdef, parameters); raw inputs and a dynamic graph, as the authors' code has them.
+        path: .t7, .pt or .pth for a file that `torch.load` reads, .safetensors for that format.
 
     Raises:
         InputError: a structure that the authors' code does not have, or an unknown suffix.
     """
+    suffix = Path(path).suffix
+    if suffix not in (*TORCH_SUFFIXES, ".safetensors"):
+        raise InputError(f"{path} has no known suffix: use one of {', '.join(TORCH_SUFFIXES)} or .safetensors")
     config = Model(*model).config
     if config.inputs != "raw" or config.graph != "dynamic":
         raise InputError("only a model with raw inputs and a dynamic graph can be written in the authors' form")
@@ -98,12 +100,10 @@ def save_released(model: tuple[nnx.GraphDef, nnx.State], file: BinaryIO, suffix:
             dims = 1 if name.split(".")[0] in _LAYERS_ON_LISTS else 2
             value = value.T.reshape(*value.shape[::-1], *(1,) * dims)
         tensors[name] = np.ascontiguousarray(value, dtype=np.float32)
-    if suffix in TORCH_SUFFIXES:
-        write_state_dict(tensors, file)
-    elif suffix == ".safetensors":
-        file.write(save(tensors))
+    if suffix == ".safetensors":
+        write_whole(path, save(tensors))
     else:
-        raise InputError(f"cannot write {suffix!r} files: use one of {', '.join(TORCH_SUFFIXES)} or .safetensors")
+        write_whole(path, state_dict_bytes(tensors))
 
 
 def _released_names() -> dict[str, tuple[str, ...]]:

@@ -61,14 +61,16 @@ def read_state_dict(path: Path) -> dict[str, np.ndarray]:
     return {str(name): tensor for name, tensor in value.items()}
 
 
-def write_state_dict(tensors: dict[str, np.ndarray], file: io.BufferedIOBase) -> None:
-    """Write float32 tensors as a file that `torch.load(..., weights_only=True)` reads."""
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+def state_dict_bytes(tensors: dict[str, np.ndarray]) -> bytes:
+    """Return float32 tensors as the content of a file that `torch.load(..., weights_only=True)` reads."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr("archive/data.pkl", _pickle_of(tensors))
         archive.writestr("archive/byteorder", "little")
         for index, tensor in enumerate(tensors.values()):
             archive.writestr(f"archive/data/{index}", np.ascontiguousarray(tensor, dtype="<f4").tobytes())
         archive.writestr("archive/version", "3\n")
+    return buffer.getvalue()
 
 
 class _Storage:

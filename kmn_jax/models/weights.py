@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import BinaryIO
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,16 +13,17 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from kmn_jax.checks import InputError
+from kmn_jax.files import write_whole
 from kmn_jax.models.keymatchnet import KeyMatchNet, KeyMatchNetConfig, Model
 
 _CONFIG_KEY = "kmn_jax.config"
 
 
-def save_model(model: tuple[nnx.GraphDef, nnx.State], file: BinaryIO) -> None:
-    """Write parameters and config to a file open for binary writing."""
-    tensors = {".".join(path): np.ascontiguousarray(value[...]) for path, value in nnx.to_flat_state(model[1])}
+def save_model(model: tuple[nnx.GraphDef, nnx.State], path: str | Path) -> None:
+    """Write parameters and config to a .safetensors file."""
+    tensors = {".".join(map(str, path)): np.ascontiguousarray(value[...]) for path, value in nnx.to_flat_state(model[1])}
     config = json.dumps(dataclasses.asdict(Model(*model).config))
-    file.write(save(tensors, metadata={_CONFIG_KEY: config}))
+    write_whole(path, save(tensors, metadata={_CONFIG_KEY: config}))
 
 
 def is_model_file(path: str | Path) -> bool:
@@ -44,7 +44,7 @@ def load_model(path: str | Path) -> Model:
     try:
         with safe_open(str(path), "np") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118: not a mapping
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a mapping)
     except (SafetensorError, OSError) as error:
         raise InputError(f"{path} is not a readable model file: {error}") from None
     if _CONFIG_KEY not in metadata:
@@ -55,7 +55,7 @@ def load_model(path: str | Path) -> Model:
         raise InputError(f"{path} has a config that this version of kmn_jax cannot use: {error}") from None
     graphdef, parameters = nnx.split(nnx.eval_shape(lambda: KeyMatchNet(config, rngs=nnx.Rngs(0))))
     flat = dict(nnx.to_flat_state(parameters))
-    wanted = {".".join(target): target for target in flat}
+    wanted = {".".join(map(str, target)): target for target in flat}
     problems = [f"{name} is missing" for name in wanted if name not in tensors]
     problems += [f"{name} is unknown" for name in tensors if name not in wanted]
     problems += [

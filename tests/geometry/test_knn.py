@@ -118,3 +118,10 @@ def test_nearest_without_real_points_is_infinitely_far() -> None:
     indices, distances = nearest(jnp.ones((3, 3)), jnp.full((4, 3), jnp.nan), jnp.zeros(4, dtype=bool))
     assert np.isposinf(distances).all()
     assert ((np.asarray(indices) >= 0) & (np.asarray(indices) < 4)).all()
+
+
+def test_k_nearest_keeps_its_digits_far_from_the_origin() -> None:
+    points = (np.random.default_rng(0).random((600, 3)) * 100 + [0, 0, 1000]).astype(np.float32)
+    exact = ((points[:, None].astype(np.float64) - points[None]) ** 2).sum(axis=-1)
+    want = np.sort(np.argsort(exact, axis=1)[:, :20])
+    np.testing.assert_array_equal(np.sort(k_nearest(jnp.asarray(points), jnp.asarray(points), 20)), want)

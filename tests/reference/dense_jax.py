@@ -20,9 +20,9 @@ def group_norm(z, scale, bias, groups=32):
     return ((rows - mean) / jnp.sqrt(variance + 1e-5)).reshape(z.shape) * scale + bias
 
 
-def layer(x, parameters):
+def layer(x, parameters, groups=32):
     z = jnp.matmul(x, parameters["kernel"], precision=HIGHEST)
-    z = group_norm(z, parameters["norm_scale"], parameters["norm_bias"])
+    z = group_norm(z, parameters["norm_scale"], parameters["norm_bias"], groups)
     return jnp.where(z >= 0, z, 0.2 * z)
 
 
@@ -65,13 +65,13 @@ def encode_scene(cloud, parameters, k=20, graphs=None):
     return encode(cloud, parameters["scene"], k, None, graphs)
 
 
-def match(scene, part, parameters):
+def match(scene, part, parameters, groups=32):
     shape = (len(scene), len(part))
     part = jnp.broadcast_to(part[None], (*shape, part.shape[-1]))
     scene = jnp.broadcast_to(scene[:, None], (*shape, scene.shape[-1]))
     head = parameters["head"]
-    x = layer(jnp.concatenate([scene, part], axis=-1), head["scene_pair"]).max(1, keepdims=True)
+    x = layer(jnp.concatenate([scene, part], axis=-1), head["scene_pair"], groups).max(1, keepdims=True)
     x = jnp.broadcast_to(x, (*shape, x.shape[-1]))
-    x = layer(jnp.concatenate([x, part], axis=-1), head["context_pair"])
+    x = layer(jnp.concatenate([x, part], axis=-1), head["context_pair"], groups)
     segmentation = jnp.matmul(x.max(1), head["segmentation"], precision=HIGHEST)
     return segmentation, jnp.matmul(x, head["keypoint"], precision=HIGHEST)[..., 0]

@@ -1,0 +1,246 @@
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from kmn_jax.checks import InputError
+from kmn_jax.models import KeyMatchNetConfig, create_model, encode_object, encode_scene, match
+from kmn_jax.models.keymatchnet import Model
+from kmn_jax.models.normalization import released_object, released_scene
+from tests.reference import dense_jax
+from tests.reference.clouds import box_cloud, scene_crop
+
+SMALL = {
+    "edge_width": 32,
+    "embedding_width": 64,
+    "scene_width": 64,
+    "object_width": 32,
+    "pair_width": 64,
+    "num_neighbors": 8,
+}
+KEYPOINTS = np.arange(12) * 15
+
+
+def small_model(seed: int = 0, **changes) -> Model:
+    """Return a narrow network with GroupNorm weights of both signs."""
+    model = create_model(KeyMatchNetConfig(**(SMALL | changes)), jax.random.key(seed))
+    rng = np.random.default_rng(seed)
+    flat = {}
+    for path, value in nnx.to_flat_state(model.parameters):
+        if path[-1] == "norm_scale":
+            value = value.replace(
+                jnp.asarray(rng.uniform(0.5, 1.5, value.shape) * rng.choice([-1, 1], value.shape), "f4")
+            )
+        if path[-1] == "norm_bias":
+            value = value.replace(jnp.asarray(rng.normal(size=value.shape) * 0.3, "f4"))
+        flat[path] = value
+    return Model(model.graphdef, nnx.from_flat_state(flat))
+
+
+def logits(model: Model, crop: np.ndarray, cloud: np.ndarray, length=None, mask=None, keypoints=KEYPOINTS) -> list:
+    part = encode_object(model, cloud, keypoints, length)
+    return [np.asarray(x) for x in match(model, encode_scene(model, crop, length, mask), part)]
+
+
+def assert_close(got: list, want: list, tolerance: float = 1e-4) -> None:
+    for a, b in zip(got, want, strict=True):
+        np.testing.assert_allclose(a, b, atol=tolerance * np.ptp(b))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_forward_is_the_dense_one(seed: int) -> None:
+    model = small_model(seed, normalization="released")
+    crop, cloud = scene_crop(seed, 300), box_cloud(seed + 10, 280)
+    parameters = nnx.to_pure_dict(model.parameters)
+    with jax.numpy_rank_promotion("allow"):
+        scene = dense_jax.encode_scene(released_scene(jnp.asarray(crop), None), parameters, 8)
+        part = dense_jax.encode_object(released_object(jnp.asarray(cloud)), KEYPOINTS, parameters, 8)
+        want = dense_jax.match(scene, part, parameters)
+    assert_close(logits(model, crop, cloud), [np.asarray(x) for x in want])
+
+
+@pytest.mark.parametrize("inputs", ["raw", "invariant"])
+@pytest.mark.parametrize("real", [200, 30, 5])
+def test_padded_crop_equals_the_unpadded_one(inputs: str, real: int) -> None:
+    """5 real points are fewer than the 8 neighbours asked for."""
+    model = small_model(normalization="metric", inputs=inputs)
+    crop, cloud = scene_crop(1, 300), box_cloud(11, 280)
+    crop[real:] = np.nan
+    mask = np.arange(300) < real
+    got = logits(model, crop, cloud, 50.0, mask)
+    assert_close([x[:real] for x in got], logits(model, crop[:real], cloud, 50.0))
+    assert (got[0][real:].argmax(axis=1) == 0).all()
+    assert all(np.isfinite(x).all() for x in got)
+
+
+def test_released_normalisation_ignores_padding_too() -> None:
+    model = small_model(normalization="released")
+    crop, cloud = scene_crop(2, 300), box_cloud(12, 280)
+    crop[250:] = 1e4
+    got = logits(model, crop, cloud, None, np.arange(300) < 250)
+    assert_close([x[:250] for x in got], logits(model, crop[:250], cloud))
+
+
+def test_vmap_equals_one_by_one() -> None:
+    model = small_model()
+    crops = jnp.stack([jnp.asarray(scene_crop(seed, 200)) for seed in range(4)])
+    masks = jnp.arange(200)[None, :] < jnp.array([200, 150, 100, 180])[:, None]
+    part = encode_object(model, box_cloud(3, 280), KEYPOINTS, 50.0)
+    batched = jax.vmap(lambda crop, mask: match(model, encode_scene(model, crop, 50.0, mask), part))(crops, masks)
+    for index in range(4):
+        single = match(model, encode_scene(model, crops[index], 50.0, masks[index]), part)
+        assert_close([np.asarray(x[index]) for x in batched], [np.asarray(x) for x in single])
+
+
+def test_one_scene_against_several_objects() -> None:
+    model = small_model()
+    scene = encode_scene(model, scene_crop(4, 200), 50.0)
+    parts = [encode_object(model, box_cloud(seed, 280), KEYPOINTS, 50.0) for seed in (5, 6)]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *parts)
+    batched = jax.vmap(lambda part: match(model, scene, part))(stacked)
+    for index, part in enumerate(parts):
+        assert_close([np.asarray(x[index]) for x in batched], [np.asarray(x) for x in match(model, scene, part)])
+
+
+def test_metric_scaling_does_not_know_the_unit() -> None:
+    model = small_model(normalization="metric")
+    crop, cloud = scene_crop(5, 200), box_cloud(15, 280)
+    metres = np.float32([1e-3] * 3 + [1] * 3)
+    assert_close(logits(model, crop * metres, cloud * metres, 0.05), logits(model, crop, cloud, 50.0))
+
+
+def test_object_length_defaults_to_its_diameter() -> None:
+    cloud = box_cloud(6, 280)
+    distances = np.linalg.norm(cloud[:, None, :3] - cloud[None, :, :3], axis=-1)
+    part = encode_object(small_model(), cloud, KEYPOINTS)
+    np.testing.assert_allclose(part.length, distances.max(), rtol=1e-5)
+    np.testing.assert_array_equal(part.keypoints, cloud[KEYPOINTS])
+
+
+def test_invariant_inputs_do_not_know_the_rotation() -> None:
+    model = small_model(inputs="invariant")
+    crop, cloud = scene_crop(7, 200), box_cloud(17, 280)
+    rotation, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
+    rotation = (rotation * np.sign(np.linalg.det(rotation))).astype(np.float32)
+
+    def rotated(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([x[:, :3] @ rotation.T, x[:, 3:] @ rotation.T], axis=1)
+
+    static = small_model(inputs="invariant", graph="static")
+    assert_close(logits(static, rotated(crop), rotated(cloud), 50.0), logits(static, crop, cloud, 50.0), 1e-3)
+    a, b = logits(model, rotated(crop), rotated(cloud), 50.0), logits(model, crop, cloud, 50.0)
+    assert (np.abs(a[0] - b[0]) < 1e-2 * np.ptp(b[0])).mean() > 0.98  # a feature-space near-tie may flip
+
+
+def test_static_graph_is_the_dense_network_on_the_coordinates_graph() -> None:
+    model = small_model(normalization="released", graph="static")
+    crop, cloud = scene_crop(8, 300), box_cloud(18, 280)
+    scene, part = released_scene(jnp.asarray(crop), None), released_object(jnp.asarray(cloud))
+    parameters = nnx.to_pure_dict(model.parameters)
+    with jax.numpy_rank_promotion("allow"):
+        graph, part_graph = dense_jax.neighbours(scene[:, :3], 8), dense_jax.neighbours(part[:, :3], 8)
+        want = dense_jax.match(
+            dense_jax.encode_scene(scene, parameters, 8, [graph] * 3),
+            dense_jax.encode_object(part, KEYPOINTS, parameters, 8, [part_graph] * 2),
+            parameters,
+        )
+    assert_close(logits(model, crop, cloud), [np.asarray(x) for x in want], 1e-5)
+
+
+def test_bfloat16_stays_close() -> None:
+    crop, cloud = scene_crop(9, 300), box_cloud(19, 280)
+    exact = logits(small_model(graph="static"), crop, cloud, 50.0)
+    model = small_model(graph="static", compute="bfloat16")
+    half = logits(model, crop, cloud, 50.0)
+    assert encode_scene(model, crop, 50.0).dtype == jnp.bfloat16
+    for a, b in zip(half, exact, strict=True):
+        assert a.dtype == np.float32
+        assert np.sqrt(np.mean((a - b) ** 2)) < 0.02 * np.ptp(b)
+
+
+@pytest.mark.parametrize("pair_dropout", ["shared", "per_pair"])
+def test_training_forward_has_finite_keyed_gradients(pair_dropout: str) -> None:
+    model = small_model(pair_dropout=pair_dropout)
+    crop, cloud = jnp.asarray(scene_crop(10, 150)), jnp.asarray(box_cloud(20, 160))
+    length = jnp.float32(50)
+
+    @jax.jit
+    def gradient(key):
+        def loss(parameters):
+            outputs = nnx.merge(model.graphdef, parameters)(crop, cloud, jnp.arange(10), length, None, key)
+            return sum((x**2).mean() for x in outputs)
+
+        return jax.tree.leaves(jax.grad(loss)(model.parameters))
+
+    first, again, other = (gradient(jax.random.key(seed)) for seed in (0, 0, 1))
+    assert all(bool(jnp.isfinite(x).all()) for x in first)
+    assert all(bool((a == b).all()) for a, b in zip(first, again, strict=True))
+    assert any(bool((a != b).any()) for a, b in zip(first, other, strict=True))
+    assert all(bool((x != 0).any()) for x in first), "every parameter takes part"
+
+
+def test_parameter_count_is_the_published_one() -> None:
+    model = create_model(KeyMatchNetConfig(), jax.random.key(0))
+    assert sum(x.size for x in jax.tree.leaves(model.parameters)) == 2_026_240
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"edge_width": 33}, "multiple of groups"),
+        ({"groups": 0}, "at least 1"),
+        ({"dropout": 1.0}, r"in \[0, 1\)"),
+        ({"inputs": "invariant", "normalization": "released"}, 'need normalization "metric"'),
+        ({"num_keypoints": 50, "num_object_points": 40}, "cannot be drawn"),
+    ],
+)
+def test_contradictory_configs_are_refused(changes: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        KeyMatchNetConfig(**changes)
+
+
+def test_bad_input_gets_one_clear_error() -> None:
+    model = small_model()
+    crop, cloud = scene_crop(0, 50), box_cloud(0, 280)
+    broken = crop.copy()
+    broken[7, 2] = np.nan
+    infinite = cloud.copy()
+    infinite[3, 0] = np.inf
+    part = encode_object(model, cloud, KEYPOINTS)
+    cases = [
+        (lambda: encode_scene(model, broken), r"scene_crop holds 1 values .* \(7, 2\)"),
+        (lambda: encode_object(model, infinite, KEYPOINTS), "object_cloud holds 1 values"),
+        (lambda: encode_scene(model, crop[:, :3]), r"shape \(50, 3\), but must have shape \(any, 6\)"),
+        (lambda: encode_scene(model, crop[None]), "must have shape"),
+        (lambda: encode_scene(model, crop[:0]), "empty"),
+        (lambda: encode_scene(model, crop[0]), "must have shape"),
+        (lambda: encode_scene(model, crop.astype(int)), "floating point"),
+        (lambda: encode_scene(model, crop.astype(str)), "not an array of numbers|floating point"),
+        (lambda: encode_scene(model, crop[:1] * 0), "no extent"),
+        (lambda: encode_scene(model, crop, -1.0), "above zero"),
+        (lambda: encode_scene(model, crop, np.nan), "NaN"),
+        (lambda: encode_scene(model, crop, mask=np.zeros(50, bool)), "no real point"),
+        (lambda: encode_scene(model, crop, mask=np.zeros(49, bool)), "mask has shape"),
+        (lambda: encode_scene(model, crop, mask=np.ones(50)), "must be bool"),
+        (lambda: encode_object(model, cloud, [0, 280]), r"outside of \[0, 280\)"),
+        (lambda: encode_object(model, cloud, [0.5]), "integers"),
+        (lambda: encode_object(model, cloud, np.zeros(0, int)), "empty"),
+        (lambda: encode_object(model, np.ones_like(cloud), KEYPOINTS), "no extent"),
+        (lambda: match(model, crop, part), "scene_width"),
+        (lambda: match(model, encode_scene(model, crop) * np.nan, part), "NaN"),
+    ]
+    for call, message in cases:
+        with pytest.raises(InputError, match=message):
+            call()
+
+
+def test_degenerate_crops_stay_finite() -> None:
+    model = small_model()
+    cloud = box_cloud(0, 280)
+    one = scene_crop(0, 1) + np.float32([1, 0, 0, 0, 0, 0])
+    duplicated = np.repeat(scene_crop(0, 4), 20, axis=0)
+    for crop in (one, duplicated):
+        assert all(np.isfinite(x).all() for x in logits(model, crop, cloud, 50.0))

@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kmn_jax.models import LossConfig, keypoint_labels, matching_loss
+
+
+def reference(segmentation, keypoint, on_object, labels):
+    """Cross entropies by hand, in float64."""
+
+    def entropy(logits, target):
+        logits = logits.astype(np.float64)
+        return np.log(np.exp(logits).sum(axis=1)) - logits[np.arange(len(target)), target]
+
+    a = entropy(segmentation, on_object.astype(int)).mean()
+    b = entropy(keypoint[on_object], labels[on_object]).mean()
+    return 0.2 * a + 0.8 * b, a, b
+
+
+def example(seed: int, n: int = 60, k: int = 7):
+    rng = np.random.default_rng(seed)
+    return (
+        rng.normal(size=(n, 2)).astype("f4"),
+        rng.normal(size=(n, k)).astype("f4"),
+        rng.random(n) < 0.6,
+        rng.integers(0, k, n).astype("i4"),
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_loss_and_accuracies_by_hand(seed: int) -> None:
+    segmentation, keypoint, on_object, labels = example(seed)
+    loss = matching_loss(*map(jnp.asarray, (segmentation, keypoint, on_object, labels)))
+    np.testing.assert_allclose(loss[:3], reference(segmentation, keypoint, on_object, labels), rtol=1e-5)
+    np.testing.assert_allclose(loss.segmentation_accuracy, (segmentation.argmax(1) == on_object).mean(), rtol=1e-6)
+    right = keypoint[on_object].argmax(1) == labels[on_object]
+    np.testing.assert_allclose(loss.keypoint_accuracy, right.mean(), rtol=1e-6)
+    assert (int(loss.num_points), int(loss.num_object_points)) == (60, on_object.sum())
+
+
+def test_padding_and_background_labels_do_not_matter() -> None:
+    segmentation, keypoint, on_object, labels = example(3)
+    mask = np.arange(60) < 41
+    want = matching_loss(*(jnp.asarray(x[:41]) for x in (segmentation, keypoint, on_object, labels)))
+    labels = np.where(on_object & mask, labels, 10**6).astype("i4")
+    got = matching_loss(*map(jnp.asarray, (segmentation, keypoint, on_object, labels, mask)))
+    np.testing.assert_allclose(got, want, rtol=1e-6)
+
+
+def test_no_object_point_means_no_keypoint_loss_and_no_nan() -> None:
+    segmentation, keypoint, _, labels = map(jnp.asarray, example(4))
+
+    def total(logits):
+        return matching_loss(segmentation, logits, jnp.zeros(60, bool), labels).total
+
+    loss = matching_loss(segmentation, keypoint, jnp.zeros(60, bool), labels)
+    assert float(loss.keypoint) == float(loss.keypoint_accuracy) == 0
+    assert int(loss.num_object_points) == 0
+    assert bool((jax.grad(total)(keypoint) == 0).all())
+
+
+def test_labels_are_the_nearest_keypoints() -> None:
+    rng = np.random.default_rng(5)
+    points, keypoints = rng.normal(size=(50, 3)).astype("f4"), rng.normal(size=(6, 3)).astype("f4")
+    distances = np.linalg.norm(points[:, None] - keypoints[None], axis=-1)
+    labels, distance = keypoint_labels(jnp.asarray(points), jnp.asarray(keypoints))
+    np.testing.assert_array_equal(labels, distances.argmin(axis=1))
+    np.testing.assert_allclose(distance, distances.min(axis=1), rtol=1e-5)
+
+
+def test_weights_are_checked() -> None:
+    for weights in ((-1, 1), (0, 0)):
+        with pytest.raises(ValueError, match="loss weights"):
+            LossConfig(*weights)
