@@ -21,7 +21,9 @@ _CONFIG_KEY = "kmn_jax.config"
 
 def save_model(model: tuple[nnx.GraphDef, nnx.State], path: str | Path) -> None:
     """Write parameters and config to a .safetensors file."""
-    tensors = {".".join(map(str, path)): np.ascontiguousarray(value[...]) for path, value in nnx.to_flat_state(model[1])}
+    tensors = {
+        ".".join(map(str, path)): np.ascontiguousarray(value[...]) for path, value in nnx.to_flat_state(model[1])
+    }
     config = json.dumps(dataclasses.asdict(Model(*model).config))
     write_whole(path, save(tensors, metadata={_CONFIG_KEY: config}))
 

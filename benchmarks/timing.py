@@ -1,0 +1,219 @@
+"""The one timing kernel: compilation apart from running, rivals in turn, device and versions beside every number.
+
+Rules, each against a mistake that changes results: an asynchronous call is timed to `block_until_ready`;
+tracing, compiling and the first run are reported apart; rivals run in turn within one loop, so that a
+machine that slows down slows all of them; each turn begins with a pause and an untimed call, since the rival
+before may still be freeing memory and leave threads spinning; the median of the repeats counts, the spread is
+shown.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+ROOT = Path(__file__).parent.parent
+
+_TIMED_A_TURN = 3
+_PAUSE_S = 0.05
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """A compiled function with what it took to get there, in seconds, and its temporary memory in bytes."""
+
+    function: Callable[..., Any]
+    trace_s: float
+    lower_s: float
+    compile_s: float
+    first_run_s: float
+    temporary_bytes: int
+
+
+@dataclass(frozen=True)
+class Steady:
+    """Steady-state times of one candidate, in milliseconds."""
+
+    median_ms: float
+    minimum_ms: float
+    p90_ms: float
+    repeats: int
+
+
+def compile_for(function: Callable[..., Any], *arguments: Any) -> Compiled:
+    """Trace, lower, compile and run once, each timed on its own. `function` may be jitted already."""
+    jitted = function if hasattr(function, "trace") else jax.jit(function)
+    start = time.perf_counter()
+    traced = jitted.trace(*arguments)
+    after_trace = time.perf_counter()
+    lowered = traced.lower()
+    after_lower = time.perf_counter()
+    compiled = lowered.compile()
+    after_compile = time.perf_counter()
+    jax.block_until_ready(compiled(*arguments))
+    after_first = time.perf_counter()
+    memory = compiled.memory_analysis()
+    return Compiled(
+        compiled,
+        after_trace - start,
+        after_lower - after_trace,
+        after_compile - after_lower,
+        after_first - after_compile,
+        int(getattr(memory, "temp_size_in_bytes", 0)),
+    )
+
+
+def time_in_turn(
+    candidates: Mapping[str, Callable[[], Any]], repeats: int = 15, limit_s: float = 120.0
+) -> dict[str, Steady]:
+    """Time each candidate three times a round for `repeats` timings in all; stop early after `limit_s`."""
+    times: dict[str, list[float]] = {name: [] for name in candidates}
+    begin = time.perf_counter()
+    while min(map(len, times.values())) < repeats:
+        for name, candidate in candidates.items():
+            time.sleep(_PAUSE_S)
+            jax.block_until_ready(candidate())
+            for _ in range(_TIMED_A_TURN):
+                start = time.perf_counter()
+                jax.block_until_ready(candidate())
+                times[name].append(1e3 * (time.perf_counter() - start))
+        if time.perf_counter() - begin > limit_s:
+            break
+    return {
+        name: Steady(float(np.median(t)), float(np.min(t)), float(np.percentile(t, 90)), len(t))
+        for name, t in times.items()
+    }
+
+
+@dataclass(frozen=True)
+class Ceilings:
+    """What this device reaches on the two simplest operations; floors are computed from them."""
+
+    matmul_flops: float  # float32 at full precision, FLOP/s
+    matmul_bfloat16_flops: float  # FLOP/s
+    copy_bytes: float  # bytes read plus bytes written, per second
+
+    def floor_ms(self, flops: float, transferred: float) -> float:
+        """Return the larger of arithmetic time (float32) and memory time."""
+        return 1e3 * max(flops / self.matmul_flops, transferred / self.copy_bytes)
+
+
+def measure_ceilings() -> Ceilings:
+    """Measure a large matrix product and a large copy, on random data."""
+    on_cpu = jax.default_backend() == "cpu"
+    size, length = (2048, 2**26) if on_cpu else (8192, 2**30)
+    a = jax.random.normal(jax.random.key(0), (size, size))
+    half = a.astype(jnp.bfloat16)
+    x = jax.random.normal(jax.random.key(1), (length,))
+    highest = compile_for(lambda m: jnp.matmul(m, m, precision=jax.lax.Precision.HIGHEST), a).function
+    low = compile_for(lambda m: jnp.matmul(m, m), half).function
+    copy = jax.jit(lambda v: v + 1, donate_argnums=0)  # in place: fresh pages would cost more than the copy
+    buffer = [x]
+
+    def copy_in_place() -> jax.Array:
+        buffer[0] = copy(buffer[0])
+        return buffer[0]
+
+    times = time_in_turn({"f32": lambda: highest(a), "bf16": lambda: low(half), "copy": copy_in_place}, 9)
+    flops = 2.0 * size**3
+    return Ceilings(
+        flops / (1e-3 * times["f32"].median_ms),
+        flops / (1e-3 * times["bf16"].median_ms),
+        8.0 * length / (1e-3 * times["copy"].median_ms),
+    )
+
+
+def environment() -> dict[str, Any]:
+    """Return device, versions, commit, date and command."""
+    packages = ("jax", "jaxlib", "flax", "numpy", "torch", "open3d")
+    versions = {"python": platform.python_version()}
+    for package in packages:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return {
+        "device": str(jax.devices()[0].device_kind),
+        "platform": jax.default_backend(),
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "versions": versions,
+        "commit": _commit(),
+        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "command": " ".join(["python -m", _module(), *sys.argv[1:]]),
+    }
+
+
+def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print rows of equal keys as a Markdown table."""
+    print(f"\n### {title}\n")
+    if not rows:
+        print("(nothing ran)")
+        return
+    columns = list(rows[0])
+    cells = [columns, *([_format(row.get(column)) for column in columns] for row in rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
+    for index, row in enumerate(cells):
+        print("| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |")
+        if index == 0:
+            print("|" + "|".join("-" * (width + 2) for width in widths) + "|")
+    sys.stdout.flush()
+
+
+def write_json(path: Path | None, results: Mapping[str, Any]) -> None:
+    """Write results and environment to `path`, if there is one."""
+    if path is None:
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"environment": environment(), **results}, indent=1, default=_plain) + "\n")
+    print(f"\nwrote {path}")
+
+
+def _plain(value: Any) -> Any:
+    return asdict(value) if hasattr(value, "__dataclass_fields__") else float(value)
+
+
+def _format(value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
+    return str(value)
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def _commit() -> str:
+    try:
+        result = subprocess.run(
+            ["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return result.stdout.strip()
+
+
+def _module() -> str:
+    main = sys.modules.get("__main__")
+    specification = getattr(main, "__spec__", None)
+    return specification.name if specification is not None else Path(sys.argv[0]).stem
