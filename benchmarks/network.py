@@ -20,8 +20,7 @@ from flax import nnx
 from benchmarks.memory import peak_of_each
 from benchmarks.network_cases import Case, dense_jax_forward, make_case, torch_forward
 from benchmarks.stages import measure_stages
-from benchmarks.timing import compile_for, measure_ceilings, print_table, time_in_turn, write_json
-from kmn_jax.models import Model
+from benchmarks.timing import Compiled, compile_for, measure_ceilings, print_table, time_in_turn, write_json
 from kmn_jax.models.layers import Compute
 
 
@@ -66,7 +65,7 @@ def forward_rows(batch: int, repeats: int, dense: bool) -> list[dict[str, Any]]:
     case = make_case(batch)
     on_cpu = jax.default_backend() == "cpu"
     arithmetic: tuple[Compute, ...] = ("float32", "bfloat16") if on_cpu else ("float32", "tf32", "bfloat16")
-    compiled = {}
+    compiled: dict[str, tuple[Compiled, tuple[Any, ...]]] = {}
     for compute in arithmetic:
         model = case.with_compute(compute)
         parts = jax.jit(partial(_encode_objects, model.graphdef))(model.parameters, case)
@@ -180,8 +179,6 @@ def _rms(outputs: list[np.ndarray], reference: list[np.ndarray]) -> float:
     pairs = zip(outputs, reference, strict=True)
     return max(float(np.sqrt(np.mean((a - b) ** 2)) / np.ptp(b)) for a, b in pairs)
 
-
-__all__ = ["Model", "forward_rows", "main", "memory_rows", "pair_head_rows"]
 
 if __name__ == "__main__":
     tyro.cli(main)
