@@ -9,7 +9,6 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from kmn_jax.checks import InputError, float_array, is_traced, mask_array, positive_scalar
@@ -23,7 +22,7 @@ from kmn_jax.geometry.se3 import (
 )
 from kmn_jax.pose.kabsch import fit_rigid, rotation_is_determined
 from kmn_jax.pose.result import PoseResult, PoseStatus
-from kmn_jax.typing import Mask, Normals, Points, Pose, Scalar
+from kmn_jax.typing import ArrayInput, Mask, Normals, Points, Pose, Scalar
 
 _MIN_PAIRS = 6  # equations that fix a pose when each pair gives one
 _DIVERGED = 0.01  # of the squared gate: a cost that grows by less is noise about the optimum
@@ -73,13 +72,13 @@ class _State(NamedTuple):
 
 
 def icp(
-    object_points: ArrayLike,
-    scene_points: ArrayLike,
-    T_scene_object: ArrayLike,
-    object_diameter: ArrayLike,
-    scene_normals: ArrayLike | None = None,
-    object_mask: ArrayLike | None = None,
-    scene_mask: ArrayLike | None = None,
+    object_points: ArrayInput,
+    scene_points: ArrayInput,
+    T_scene_object: ArrayInput,
+    object_diameter: ArrayInput,
+    scene_normals: ArrayInput | None = None,
+    object_mask: ArrayInput | None = None,
+    scene_mask: ArrayInput | None = None,
     config: IcpConfig = IcpConfig(),
 ) -> PoseResult:
     """Refine an initial T_scene_object (4, 4) so that object points (m, 3) meet scene points (n, 3).

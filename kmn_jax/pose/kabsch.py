@@ -5,18 +5,17 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from kmn_jax.checks import InputError, float_array, is_traced
 from kmn_jax.geometry.eigen import dominant_eigenvector
 from kmn_jax.geometry.se3 import from_rotation_translation, quaternion_to_matrix
-from kmn_jax.typing import Points, Pose, Rotation
+from kmn_jax.typing import ArrayInput, Points, Pose, Rotation
 
 _MIN_SPREAD = 1e-4  # variance across the line over variance along it, below which points count as collinear
 
 
-def kabsch(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> jax.Array:
+def kabsch(source: ArrayInput, target: ArrayInput, weights: ArrayInput | None = None) -> jax.Array:
     """Return T_target_source (4, 4), the rigid motion that takes source points closest to target points.
 
     It minimises sum_i w_i |R source_i + t - target_i|^2 over proper rotations (never a mirror image) for points

@@ -10,11 +10,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from kmn_jax.checks import InputError, float_array, is_traced, mask_array, positive_scalar
-from kmn_jax.typing import Normals, Points, Scalar
+from kmn_jax.typing import ArrayInput, Normals, Points, Scalar
 
 OBJECT_CLASS = 1  # segmentation logits are (background, object)
 
@@ -51,14 +50,14 @@ class MatchConfig:
 
 
 def find_matches(
-    segmentation_logits: ArrayLike,
-    keypoint_logits: ArrayLike,
-    scene_points: ArrayLike,
-    scene_normals: ArrayLike,
-    keypoints: ArrayLike,
-    keypoint_normals: ArrayLike,
-    object_diameter: ArrayLike,
-    mask: ArrayLike | None = None,
+    segmentation_logits: ArrayInput,
+    keypoint_logits: ArrayInput,
+    scene_points: ArrayInput,
+    scene_normals: ArrayInput,
+    keypoints: ArrayInput,
+    keypoint_normals: ArrayInput,
+    object_diameter: ArrayInput,
+    mask: ArrayInput | None = None,
     config: MatchConfig = MatchConfig(),
 ) -> Matches:
     """Return the matches that segmentation logits (n, 2) and keypoint logits (n, k) vote for.

@@ -10,22 +10,21 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from kmn_jax.checks import InputError, float_array, is_traced, mask_array
 from kmn_jax.geometry.se3 import compose, from_quaternion_translation, transform_points
-from kmn_jax.typing import Points, Pose, Scalar
+from kmn_jax.typing import ArrayInput, Points, Pose, Scalar
 
 PoseMetric = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
 
 
-def add(T_estimated: ArrayLike, T_true: ArrayLike, points: ArrayLike) -> jax.Array:
+def add(T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput) -> jax.Array:
     """Return the mean distance between object points (m, 3) under two poses, for objects without symmetry."""
     return _add(*_checked(T_estimated, T_true, points))
 
 
-def adi(T_estimated: ArrayLike, T_true: ArrayLike, points: ArrayLike) -> jax.Array:
+def adi(T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput) -> jax.Array:
     """Return the mean distance from each truly posed point to the nearest estimated one, for any object.
 
     It forgives symmetries, as each point may meet any other.
@@ -34,7 +33,7 @@ def adi(T_estimated: ArrayLike, T_true: ArrayLike, points: ArrayLike) -> jax.Arr
 
 
 def mssd(
-    T_estimated: ArrayLike, T_true: ArrayLike, points: ArrayLike, symmetries: ArrayLike | None = None
+    T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput, symmetries: ArrayInput | None = None
 ) -> jax.Array:
     """Return the largest distance between object points under two poses, at the most favourable symmetry.
 
@@ -47,7 +46,7 @@ def mssd(
     return _mssd(*_checked(T_estimated, T_true, points), poses)
 
 
-def discretise_symmetry(axis: ArrayLike, offset: ArrayLike, count: int) -> jax.Array:
+def discretise_symmetry(axis: ArrayInput, offset: ArrayInput, count: int) -> jax.Array:
     """Return `count` turns (count, 4, 4) about an axis (3,) of any length through the point `offset` (3,).
 
     The turns are equally spaced and start with the identity. They stand for a continuous symmetry, or are exactly
@@ -63,10 +62,10 @@ def discretise_symmetry(axis: ArrayLike, offset: ArrayLike, count: int) -> jax.A
 
 def nearest_instance_error(
     metric: PoseMetric,
-    T_estimated: ArrayLike,
-    T_true: ArrayLike,
-    points: ArrayLike,
-    mask: ArrayLike | None = None,
+    T_estimated: ArrayInput,
+    T_true: ArrayInput,
+    points: ArrayInput,
+    mask: ArrayInput | None = None,
 ) -> jax.Array:
     """Return the least error of a pose against several true ones (i, 4, 4), as published results take it.
 
@@ -81,13 +80,13 @@ def nearest_instance_error(
     return jnp.where(mask, errors, jnp.inf).min()
 
 
-def bounding_box_diagonal(points: ArrayLike) -> jax.Array:
+def bounding_box_diagonal(points: ArrayInput) -> jax.Array:
     """Return the diagonal of the axis-aligned box around points (m, 3): the object's size as published."""
     points = _some_points(points)
     return jnp.sqrt(((points.max(axis=0) - points.min(axis=0)) ** 2).sum())
 
 
-def diameter(points: ArrayLike) -> jax.Array:
+def diameter(points: ArrayInput) -> jax.Array:
     """Return the largest distance between any two points (m, 3): the object's size as BOP takes it.
 
     Time grows with the square of m: thin clouds of many thousand points first, or take their convex hull.
@@ -95,12 +94,12 @@ def diameter(points: ArrayLike) -> jax.Array:
     return _diameter(_some_points(points))
 
 
-def is_correct(error: ArrayLike, size: ArrayLike, threshold: float = 0.1) -> jax.Array:
+def is_correct(error: ArrayInput, size: ArrayInput, threshold: float = 0.1) -> jax.Array:
     """Tell for each error whether it is below `threshold` times the size; an error that is NaN is not."""
     return jnp.asarray(error) < threshold * jnp.asarray(size)
 
 
-def recall(errors: ArrayLike, size: ArrayLike, threshold: float = 0.1) -> jax.Array:
+def recall(errors: ArrayInput, size: ArrayInput, threshold: float = 0.1) -> jax.Array:
     """Return the share of errors (n,) below `threshold` times the size, one for all () or one each (n,).
 
     A pose that was not found counts by an infinite error. Raises InputError without a single error.
@@ -112,7 +111,7 @@ def recall(errors: ArrayLike, size: ArrayLike, threshold: float = 0.1) -> jax.Ar
     return is_correct(errors, size, threshold).mean(dtype=jnp.float32)
 
 
-def _checked(T_estimated: ArrayLike, T_true: ArrayLike, points: ArrayLike) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _checked(T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput) -> tuple[jax.Array, jax.Array, jax.Array]:
     return (
         float_array(T_estimated, "T_estimated", (4, 4)).astype(jnp.float32),
         float_array(T_true, "T_true", (4, 4)).astype(jnp.float32),
@@ -120,7 +119,7 @@ def _checked(T_estimated: ArrayLike, T_true: ArrayLike, points: ArrayLike) -> tu
     )
 
 
-def _some_points(points: ArrayLike) -> jax.Array:
+def _some_points(points: ArrayInput) -> jax.Array:
     array = float_array(points, "points", (None, 3)).astype(jnp.float32)
     if array.shape[0] == 0:
         raise InputError("points is empty, but at least one point is needed")
