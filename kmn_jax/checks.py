@@ -78,6 +78,20 @@ def positive_scalar(value: ArrayInput, name: str) -> jax.Array:
     return array
 
 
+def rigid_pose(value: ArrayInput, name: str) -> jax.Array:
+    """Return a (4, 4) matrix of a proper rotation and a translation, to the digits that pose files carry."""
+    array = float_array(value, name, (4, 4))
+    if not is_traced(array):
+        matrix = np.asarray(array, dtype=np.float64)
+        rotation, last_row = matrix[:3, :3], matrix[3]
+        orthogonal = np.allclose(rotation.T @ rotation, np.eye(3), atol=5e-3) and np.linalg.det(rotation) > 0
+        if not orthogonal or not np.allclose(last_row, [0, 0, 0, 1], atol=1e-6):
+            raise InputError(
+                f"{name} is not a rigid pose: it needs a rotation without scale or reflection and a last row 0 0 0 1"
+            )
+    return array
+
+
 @jax.jit
 def _all_finite(array: jax.Array, mask: jax.Array | None) -> jax.Array:
     finite = jnp.isfinite(array)
@@ -88,7 +102,8 @@ def _all_finite(array: jax.Array, mask: jax.Array | None) -> jax.Array:
 
 def _array(value: ArrayInput, name: str, shape: tuple[int | None, ...]) -> jax.Array:
     try:
-        array = value if isinstance(value, jax.Array) else jnp.asarray(np.asarray(value))
+        with np.errstate(over="ignore"):  # what does not fit float32 becomes infinite, which is reported as such
+            array = value if isinstance(value, jax.Array) else jnp.asarray(np.asarray(value))
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} is not an array of numbers: {error}") from None
     if array.ndim != len(shape) or any(want not in (None, have) for want, have in zip(shape, array.shape, strict=True)):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from kmn_jax.checks import InputError, float_array, is_traced, mask_array, positive_scalar
+from kmn_jax.checks import InputError, float_array, is_traced, mask_array, positive_scalar, rigid_pose
 from kmn_jax.geometry.knn import nearest
 from kmn_jax.geometry.se3 import (
     compose,
@@ -94,7 +94,8 @@ def icp(
     finite is INVALID_INPUT, with the identity as the pose. `score` is the share of scene points
     within the gate.
 
-    Raises InputError for wrong shapes and dtypes, values that are not finite and missing normals.
+    Raises InputError for wrong shapes and dtypes, values that are not finite, an initial pose that is not rigid
+    and missing normals.
     """
     object_count, scene_count = (np.shape(a)[0] if np.ndim(a) else 0 for a in (object_points, scene_points))
     object_mask = mask_array(object_mask, "object_mask", object_count)
@@ -105,7 +106,7 @@ def icp(
     arrays = [
         float_array(object_points, "object_points", (None, 3), mask=object_rows),
         float_array(scene_points, "scene_points", (None, 3), mask=scene_rows),
-        float_array(T_scene_object, "T_scene_object", (4, 4)),
+        rigid_pose(T_scene_object, "T_scene_object"),
         positive_scalar(object_diameter, "object_diameter"),
     ]
     if object_count == 0 or scene_count == 0:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from kmn_jax.checks import InputError, float_array, is_traced, mask_array
+from kmn_jax.checks import InputError, float_array, is_traced, mask_array, rigid_pose
 from kmn_jax.geometry.se3 import compose, from_quaternion_translation, transform_points
 from kmn_jax.typing import ArrayInput, Points, Pose, Scalar
 
@@ -113,8 +113,8 @@ def recall(errors: ArrayInput, size: ArrayInput, threshold: float = 0.1) -> jax.
 
 def _checked(T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput) -> tuple[jax.Array, jax.Array, jax.Array]:
     return (
-        float_array(T_estimated, "T_estimated", (4, 4)).astype(jnp.float32),
-        float_array(T_true, "T_true", (4, 4)).astype(jnp.float32),
+        rigid_pose(T_estimated, "T_estimated").astype(jnp.float32),
+        rigid_pose(T_true, "T_true").astype(jnp.float32),
         _some_points(points),
     )
 
