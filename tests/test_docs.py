@@ -1,26 +1,38 @@
-"""The Python examples in README.md and docs/ run as they stand."""
+"""The Python examples in README.md and docs/ run as they stand, on inputs that a comment before them names."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from kmn_jax.models.torch_file import state_dict_bytes
+from tests.golden.make_network import draw_state_dict
+from tests.reference.clouds import box_cloud, scene_crop
+
 ROOT = Path(__file__).parent.parent
-BLOCK = re.compile(r"(?:<!-- not run: (?P<reason>[^\n]*?) -->\n)?^```python\n(?P<code>.*?)^```$", re.M | re.S)
+BLOCK = re.compile(r"(?:<!-- given: (?P<given>[^\n]*?) -->\n)?^```python\n(?P<code>.*?)^```$", re.M | re.S)
 EXAMPLES = [
     pytest.param(path, match, id=f"{path.name}-{number}")
     for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
     for number, match in enumerate(BLOCK.finditer(path.read_text(encoding="utf-8")), start=1)
 ]
+GIVEN = {
+    "cloud": lambda: box_cloud(0, 2048),
+    "keypoint_indices": lambda: np.arange(20) * 100,
+    "crop": lambda: scene_crop(0, 2048),
+}
 
 
 @pytest.mark.parametrize(("path", "block"), EXAMPLES)
 def test_example_runs(path: Path, block: re.Match[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     line = path.read_text(encoding="utf-8").count("\n", 0, block.start("code"))
     code = compile("\n" * line + block["code"], str(path), "exec")
-    if block["reason"]:
-        pytest.skip(f"{path.name}:{line}: {block['reason']}")
     monkeypatch.chdir(tmp_path)
-    exec(code, {"__name__": "__main__"})
+    names = [name.strip() for name in (block["given"] or "").split(",") if name.strip()]
+    if "checkpoint" in names:
+        names.remove("checkpoint")
+        (tmp_path / "keymatchnet.t7").write_bytes(state_dict_bytes(draw_state_dict(0)))
+    exec(code, {"__name__": "__main__"} | {name: GIVEN[name]() for name in names})

@@ -72,6 +72,6 @@ def test_labels_are_the_nearest_keypoints() -> None:
 
 
 def test_weights_are_checked() -> None:
-    for weights in ((-1, 1), (0, 0)):
+    for weights in ((-1.0, 1.0), (0.0, 0.0)):
         with pytest.raises(ValueError, match="loss weights"):
             LossConfig(*weights)
