@@ -28,24 +28,33 @@ def float_array(
     shape: tuple[int | None, ...],
     *,
     mask: jax.Array | None = None,
+    finite: bool = True,
 ) -> jax.Array:
     """Return `value` as a floating JAX array of `shape` (None = any length), or raise InputError.
 
-    Rows where `mask` is false are padding and may hold anything. Float64 becomes the default float type.
+    Rows where `mask` is false are padding and may hold anything; `finite` false allows infinity and NaN
+    everywhere. Float64 becomes the default float type.
     """
     array = _array(value, name, shape)
     if not jnp.issubdtype(array.dtype, jnp.floating):
         raise InputError(f"{name} has dtype {array.dtype}, but must be floating point: convert it to float32")
-    if not is_traced(array) and not is_traced(mask) and not bool(_all_finite(array, mask)):
-        finite = np.isfinite(np.asarray(array, dtype=np.float32))
+    if finite and not is_traced(array) and not is_traced(mask) and not bool(_all_finite(array, mask)):
+        good = np.isfinite(np.asarray(array, dtype=np.float32))
         if mask is not None:
-            finite = finite | ~np.asarray(mask).reshape(mask.shape + (1,) * (finite.ndim - mask.ndim))
-        row = np.argwhere(~finite)[0]
+            good = good | ~np.asarray(mask).reshape(mask.shape + (1,) * (good.ndim - mask.ndim))
+        row = np.argwhere(~good)[0]
         raise InputError(
-            f"{name} holds {int((~finite).sum())} values that are NaN, infinite or beyond float32,"
+            f"{name} holds {int((~good).sum())} values that are NaN, infinite or beyond float32,"
             f" the first at index {tuple(int(i) for i in row)}: remove such points first"
         )
     return array
+
+
+def row_count(value: ArrayInput, name: str) -> int:
+    """Return the length of the first axis, 0 for a scalar."""
+    if not hasattr(value, "shape"):
+        value = _numbers(value, name)
+    return value.shape[0] if value.shape else 0
 
 
 def mask_array(value: ArrayInput | None, name: str, length: int) -> jax.Array:
@@ -101,12 +110,19 @@ def _all_finite(array: jax.Array, mask: jax.Array | None) -> jax.Array:
 
 
 def _array(value: ArrayInput, name: str, shape: tuple[int | None, ...]) -> jax.Array:
-    try:
-        with np.errstate(over="ignore"):  # what does not fit float32 becomes infinite, which is reported as such
-            array = value if isinstance(value, jax.Array) else jnp.asarray(np.asarray(value))
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} is not an array of numbers: {error}") from None
+    with np.errstate(over="ignore"):  # what does not fit float32 becomes infinite, which is reported as such
+        array = value if isinstance(value, jax.Array) else jnp.asarray(_numbers(value, name))
     if array.ndim != len(shape) or any(want not in (None, have) for want, have in zip(shape, array.shape, strict=True)):
         wanted = ", ".join("any" if want is None else str(want) for want in shape)
         raise InputError(f"{name} has shape {array.shape}, but must have shape ({wanted})")
+    return array
+
+
+def _numbers(value: ArrayInput, name: str) -> np.ndarray:
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is not an array: {error}") from None
+    if array.dtype.kind not in "biufc" and not jnp.issubdtype(array.dtype, jnp.floating):
+        raise InputError(f"{name} is not an array of numbers, but holds {array.dtype} values")
     return array

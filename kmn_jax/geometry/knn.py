@@ -8,16 +8,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+_COORDINATES = 3
 _CPU_PARTS = 16  # fewer than about ten ready operations XLA's CPU runtime keeps on one thread
 
 
 def squared_distances(queries: Float[Array, "n c"], points: Float[Array, "m c"]) -> Float[Array, "n m"]:
-    """Return all squared Euclidean distances, in float32 and clipped at zero.
+    """Return all squared Euclidean distances, in float32.
 
-    The product runs at full float32 precision whatever the default: a neighbour list is only as good as
-    the small differences between large squares.
+    Points of up to three coordinates are compared coordinate by coordinate, which is exact to rounding wherever
+    they are. Wider features go through one matrix product at full float32 precision, so that the
+    error is a rounding of the squared distances from the origin.
     """
     queries, points = queries.astype(jnp.float32), points.astype(jnp.float32)
+    if points.shape[1] <= _COORDINATES:
+        columns = [queries[:, i, None] - points[None, :, i] for i in range(points.shape[1])]
+        return sum((column**2 for column in columns[1:]), columns[0] ** 2)
     product = jnp.matmul(queries, points.T, precision=jax.lax.Precision.HIGHEST)
     squares = (queries**2).sum(axis=-1)[:, None] + (points**2).sum(axis=-1)[None, :]
     return jnp.maximum(squares - 2 * product, 0)
@@ -31,12 +36,15 @@ def k_nearest(
 ) -> Int[Array, "n k"]:
     """Return for each query the indices of its k nearest points, in no promised order but for repeats.
 
-    A query that is itself one of the points finds itself among them. Points where `mask` is false are never
-    found; with fewer than k real points, the list ends in repeats of the nearest one, so that a maximum over
-    neighbours stays right. Ties go to the lower index. Raises ValueError if k is not in [1, m].
+    A query that is itself one of the points finds itself among them, unless k others are as near to float32
+    (see `squared_distances`). Points where `mask` is false are never found; with fewer than k real points, the
+    list ends in repeats of the nearest one, so that a maximum over neighbours stays right. Ties go to the lower
+    index. All but masked points must be finite. Raises ValueError if k is not in [1, m].
     """
     if not 1 <= k <= points.shape[0]:
         raise ValueError(f"k = {k} neighbours asked of {points.shape[0]} points: choose k between 1 and their number")
+    if queries.shape[0] == 0:
+        return jnp.zeros((0, k), dtype=jnp.int32)
     queries, points = _centered(queries, points, mask)
     values, indices = jax.lax.platform_dependent(
         queries, points, mask, cpu=partial(_k_smallest_in_parts, k=k), default=partial(_k_smallest, k=k)
@@ -72,23 +80,19 @@ def nearest(
     points: Float[Array, "m c"],
     mask: Bool[Array, " m"] | None = None,
 ) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
-    """Return for each query the index of its nearest point and the distance to it.
-
-    The distance is infinite where no point is real. It is taken from the differences themselves, so that
-    it is exact near zero, where the expanded square of `squared_distances` is not.
-    """
+    """Return for each query the index of its nearest point and the distance to it, infinite where none is real."""
     distances = squared_distances(*_centered(queries, points, mask))
     if mask is not None:
         distances = jnp.where(mask[None, :], distances, jnp.inf)
-    indices = jnp.argmin(distances, axis=-1)
-    exact = jnp.sqrt(((queries - points[indices]) ** 2).sum(axis=-1))
-    return indices, jnp.where(jnp.isfinite(distances.min(axis=-1)), exact, jnp.inf)
+    return jnp.argmin(distances, axis=-1), jnp.sqrt(distances.min(axis=-1))
 
 
 def _centered(
     queries: Float[Array, "n c"], points: Float[Array, "m c"], mask: Bool[Array, " m"] | None
 ) -> tuple[Float[Array, "n c"], Float[Array, "m c"]]:
     """Move the (real) points' mean to the origin: the expanded square loses digits with distance from it."""
+    if points.shape[1] <= _COORDINATES:
+        return queries, points
     queries, points = queries.astype(jnp.float32), points.astype(jnp.float32)
     if mask is None:
         mean = points.mean(axis=0, keepdims=True)

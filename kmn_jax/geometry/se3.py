@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from kmn_jax.geometry.norms import safe_norm
 from kmn_jax.typing import Normals, Points, Pose, PRNGKey, Quaternion, Rotation, Scalar
 
 
@@ -89,12 +90,12 @@ def rotation_angle_between(R_a: Rotation, R_b: Rotation) -> Scalar:
     1e-3 near 0 and pi. The gradient at equal rotations is zero.
     """
     quaternion = matrix_to_quaternion(_product(R_a.T, R_b))
-    return 2 * jnp.arctan2(_norm(quaternion[1:]), quaternion[0])
+    return 2 * jnp.arctan2(safe_norm(quaternion[1:]), quaternion[0])
 
 
 def translation_between(T_a: Pose, T_b: Pose) -> Scalar:
     """Return the distance of the translations of two poses."""
-    return _norm(T_a[:3, 3] - T_b[:3, 3])
+    return safe_norm(T_a[:3, 3] - T_b[:3, 3])
 
 
 def pose_error(T_a: Pose, T_b: Pose) -> tuple[Scalar, Scalar]:
@@ -113,8 +114,3 @@ def random_pose(key: PRNGKey, translation_scale: Scalar | float = 1.0) -> Pose:
     return from_rotation_translation(
         random_rotation(rotation_key), translation_scale * jax.random.normal(translation_key, (3,))
     )
-
-
-def _norm(vector: Float[Array, " 3"]) -> Scalar:
-    square = (vector**2).sum()
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from kmn_jax.geometry.norms import safe_norm
+
 NUM_PAIR_INVARIANTS = 4
 NUM_SCENE_INVARIANTS = 4
 NUM_OBJECT_INVARIANTS = 2
@@ -28,10 +30,8 @@ class EncoderInputs(NamedTuple):
         if self.normals is None:
             return None
         difference = self.xyz[graph] - self.xyz[:, None, :]
-        squared = _dot(difference, difference)
-        apart = squared > 0
-        distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1)), 0)
-        direction = difference / jnp.where(apart, distance, 1)[..., None]
+        distance = safe_norm(difference)
+        direction = difference / jnp.where(distance > 0, distance, 1)[..., None]
         own, other = self.normals[:, None, :], self.normals[graph]
         return jnp.stack([distance, _dot(own, direction), _dot(other, direction), _dot(own, other)], axis=-1)
 
@@ -44,7 +44,7 @@ def raw_inputs(cloud: Float[Array, "n 6"]) -> EncoderInputs:
 def object_invariants(cloud: Float[Array, "m 6"]) -> EncoderInputs:
     """Return per point the distance from the object's centre (the origin here) and n.x."""
     xyz, normals = cloud[:, :3], cloud[:, 3:]
-    return EncoderInputs(xyz, jnp.stack([_norm(xyz), _dot(normals, xyz)], axis=1), normals)
+    return EncoderInputs(xyz, jnp.stack([safe_norm(xyz), _dot(normals, xyz)], axis=1), normals)
 
 
 def scene_invariants(cloud: Float[Array, "n 6"], mask: Bool[Array, " n"] | None) -> EncoderInputs:
@@ -56,15 +56,9 @@ def scene_invariants(cloud: Float[Array, "n 6"], mask: Bool[Array, " n"] | None)
     squared = _dot(xyz, xyz)
     seed = jnp.argmin(squared if mask is None else jnp.where(mask, squared, jnp.inf))
     seed_normal = normals[seed][None, :]
-    features = [_norm(xyz), _dot(normals, xyz), _dot(xyz, seed_normal), _dot(normals, seed_normal)]
+    features = [safe_norm(xyz), _dot(normals, xyz), _dot(xyz, seed_normal), _dot(normals, seed_normal)]
     return EncoderInputs(xyz, jnp.stack(features, axis=1), normals)
 
 
 def _dot(a: Float[Array, "... 3"], b: Float[Array, "... 3"]) -> Float[Array, "..."]:
     return (a * b).sum(axis=-1)
-
-
-def _norm(x: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    squared = _dot(x, x)
-    positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)

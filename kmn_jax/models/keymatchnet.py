@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
-from kmn_jax.checks import InputError, float_array, index_array, is_traced, mask_array, positive_scalar
+from kmn_jax.checks import InputError, float_array, index_array, is_traced, mask_array, positive_scalar, row_count
 from kmn_jax.models.encoder import Encoder, Graph
 from kmn_jax.models.invariants import (
     NUM_OBJECT_INVARIANTS,
@@ -30,6 +31,17 @@ from kmn_jax.models.layers import Compute, NormalizedLinear, dropout
 from kmn_jax.models.normalization import metric_object, metric_scene, object_extent, released_object, released_scene
 from kmn_jax.models.pair_head import PairDropout, PairHead
 from kmn_jax.typing import ArrayInput
+
+Normalization = Literal["metric", "released"]
+Inputs = Literal["raw", "invariant"]
+
+_CHOICES = {
+    "normalization": get_args(Normalization),
+    "inputs": get_args(Inputs),
+    "graph": get_args(Graph),
+    "compute": get_args(Compute),
+    "pair_dropout": get_args(PairDropout),
+}
 
 
 @dataclass(frozen=True)
@@ -58,16 +70,24 @@ class KeyMatchNetConfig:
     groups: int = 32
     dropout: float = 0.4
     pair_dropout: PairDropout = "shared"
-    normalization: Literal["metric", "released"] = "metric"
-    inputs: Literal["raw", "invariant"] = "raw"
+    normalization: Normalization = "metric"
+    inputs: Inputs = "raw"
     graph: Graph = "dynamic"
     compute: Compute = "float32"
 
     def __post_init__(self) -> None:
-        for name in ("num_scene_points", "num_object_points", "num_keypoints", "num_neighbors", "groups"):
+        for name, choices in _CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} is {getattr(self, name)!r}, but must be one of {', '.join(choices)}")
+        sizes = ("num_scene_points", "num_object_points", "num_keypoints", "num_neighbors", "groups")
+        widths = ("edge_width", "embedding_width", "scene_width", "object_width", "pair_width")
+        for name in (*sizes, *widths):
+            if not isinstance(getattr(self, name), int):
+                raise ValueError(f"{name} is {getattr(self, name)!r}, but must be a whole number")
+        for name in sizes:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, but must be at least 1")
-        for name in ("edge_width", "embedding_width", "scene_width", "object_width", "pair_width"):
+        for name in widths:
             if getattr(self, name) < 1 or getattr(self, name) % self.groups:
                 raise ValueError(f"{name} is {getattr(self, name)}, but must be a multiple of groups = {self.groups}")
         if not 0 <= self.dropout < 1:
@@ -92,6 +112,9 @@ class Model(NamedTuple):
     def config(self) -> KeyMatchNetConfig:
         """The config that the network was built from."""
         return nnx.merge(*self).config
+
+
+ModelPair: TypeAlias = tuple[nnx.GraphDef, nnx.State] | Any  # judged at the edge, like arrays
 
 
 class ObjectFeatures(NamedTuple):
@@ -204,7 +227,7 @@ def create_model(config: KeyMatchNetConfig, key: jax.Array) -> Model:
 
 
 def encode_object(
-    model: tuple[nnx.GraphDef, nnx.State],
+    model: ModelPair,
     object_cloud: ArrayInput,
     keypoint_indices: ArrayInput,
     length: ArrayInput | None = None,
@@ -224,14 +247,14 @@ def encode_object(
     indices = index_array(keypoint_indices, "keypoint_indices", None, cloud.shape[0])
     if indices.shape[0] < 1:
         raise InputError("keypoint_indices is empty: choose at least one keypoint")
-    length = object_extent(cloud[:, :3]) if length is None else positive_scalar(length, "length")
-    if not is_traced(length) and not float(length) > 0:
-        raise InputError("object_cloud has no extent: all of its points coincide")
-    return _encode_object(*model, cloud, indices, length)
+    graphdef, parameters = _pair(model)
+    extent = object_extent(cloud[:, :3])
+    _check_extent(extent, "object_cloud")
+    return _encode_object(graphdef, parameters, cloud, indices, _length(length, extent))
 
 
 def encode_scene(
-    model: tuple[nnx.GraphDef, nnx.State],
+    model: ModelPair,
     scene_crop: ArrayInput,
     length: ArrayInput | None = None,
     mask: ArrayInput | None = None,
@@ -252,24 +275,21 @@ def encode_scene(
     Raises:
         InputError: wrong shapes, dtypes, values that are not finite, fewer than one real point, no extent.
     """
-    given = None if mask is None else mask_array(mask, "mask", _rows(scene_crop, "scene_crop"))
+    given = None if mask is None else mask_array(mask, "mask", row_count(scene_crop, "scene_crop"))
     crop = _cloud(scene_crop, "scene_crop", given)
     if given is not None and not is_traced(given) and not bool(given.any()):
         raise InputError("mask is all false: scene_crop has no real point")
-    if length is None:
-        distance = jnp.sqrt((crop[:, :3] ** 2).sum(axis=1))
-        length = (distance if given is None else jnp.where(given, distance, 0)).max()
-        if not is_traced(length) and not float(length) > 0:
-            raise InputError("scene_crop has no extent: all of its points coincide with the seed")
-    else:
-        length = positive_scalar(length, "length")
-    return _encode_scene(*model, crop, length, given)
+    graphdef, parameters = _pair(model)
+    distance = jnp.sqrt((crop[:, :3] ** 2).sum(axis=1))
+    extent = (distance if given is None else jnp.where(given, distance, 0)).max()
+    _check_extent(extent, "scene_crop")
+    return _encode_scene(graphdef, parameters, crop, _length(length, extent), given)
 
 
 def match(
-    model: tuple[nnx.GraphDef, nnx.State],
+    model: ModelPair,
     scene_features: ArrayInput,
-    object_features: ObjectFeatures,
+    object_features: ObjectFeatures | Any,
 ) -> tuple[Float[Array, "n 2"], Float[Array, "n k"]]:
     """Match an encoded crop with an encoded object.
 
@@ -285,8 +305,12 @@ def match(
     Raises:
         InputError: shapes that do not belong together or values that are not finite.
     """
-    features = float_array(scene_features, "scene_features", (None, None))
-    return _match(*model, features, object_features.features)
+    graphdef, parameters = _pair(model)
+    if not isinstance(object_features, ObjectFeatures):
+        raise InputError(f"object_features is a {type(object_features).__name__}, but must come from encode_object")
+    scene = float_array(scene_features, "scene_features", (None, None))
+    keypoints = float_array(object_features.features, "object_features.features", (None, None))
+    return _match(graphdef, parameters, scene, keypoints)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -327,11 +351,26 @@ def _match(
     return network.match(scene, keypoints, mask)
 
 
-def _rows(value: ArrayInput, name: str) -> int:
-    shape = jnp.shape(value)
-    if len(shape) != 2:
-        raise InputError(f"{name} has shape {shape}, but must have shape (any, 6)")
-    return shape[0]
+def _pair(model: Any) -> tuple[nnx.GraphDef, nnx.State]:
+    if not isinstance(model, tuple) or len(model) != 2 or not isinstance(model[0], nnx.GraphDef):
+        raise InputError(
+            f"model is a {type(model).__name__}, but must be the pair (graphdef, parameters): see load_released,"
+            " load_model and create_model"
+        )
+    return model
+
+
+def _length(given: ArrayInput | None, extent: Float[Array, ""]) -> Float[Array, ""]:
+    return extent if given is None else positive_scalar(given, "length").astype(jnp.float32)
+
+
+def _check_extent(extent: Float[Array, ""], name: str) -> None:
+    if is_traced(extent):
+        return
+    if float(extent) == 0:
+        raise InputError(f"{name} has no extent: all of its points coincide")
+    if not np.isfinite(float(extent)):
+        raise InputError(f"{name} is too large for float32: use a larger unit of length")
 
 
 def _cloud(value: ArrayInput, name: str, mask: jax.Array | None = None) -> Float[Array, "n 6"]:

@@ -83,6 +83,7 @@ def keypoint_labels(
 def _mean_cross_entropy(
     logits: Float[Array, "n c"], labels: Int[Array, " n"], counted: Bool[Array, " n"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    logits = jnp.where(counted[:, None], logits, 0)  # before the softmax: padding must not reach the gradient either
     log_probability = jax.nn.log_softmax(logits.astype(jnp.float32), axis=1)
     entropy = -jnp.take_along_axis(log_probability, labels[:, None], axis=1)[:, 0]
     count = jnp.maximum(counted.sum(), 1).astype(jnp.float32)

@@ -62,7 +62,7 @@ class PairHead(nnx.Module):
         segmentation_logits = product(pooled, self.segmentation[...], compute).astype(jnp.float32)
         if mask is not None:
             segmentation_logits = jnp.where(
-                mask[:, None], segmentation_logits, jnp.array(_PADDED_SEGMENTATION)[None, :]
+                mask[:, None], segmentation_logits, jnp.array(_PADDED_SEGMENTATION, dtype=jnp.float32)[None, :]
             )
             keypoint_logits = jnp.where(mask[:, None], keypoint_logits, 0)
         return segmentation_logits, keypoint_logits

@@ -50,7 +50,10 @@ def load_released(path: str | Path, config: KeyMatchNetConfig = RELEASED_CONFIG)
     Raises:
         InputError: unreadable file, missing or unknown names, shapes other than the config's, non-finite values.
     """
-    tensors = {name.removeprefix("module."): tensor for name, tensor in _read(Path(path)).items()}
+    stored = _read(Path(path))
+    tensors = {name.removeprefix("module."): tensor for name, tensor in stored.items()}
+    if len(tensors) < len(stored):
+        raise InputError(f"{path} holds some names both with and without the prefix module.: keep one of the two")
     graphdef, parameters = nnx.split(nnx.eval_shape(lambda: KeyMatchNet(config, rngs=nnx.Rngs(0))))
     flat = dict(nnx.to_flat_state(parameters))
     names = _released_names()
@@ -65,7 +68,8 @@ def load_released(path: str | Path, config: KeyMatchNetConfig = RELEASED_CONFIG)
             flat_shape = value.shape[:2] if value.ndim >= 2 and set(value.shape[2:]) <= {1} else value.shape
             value = value.reshape(flat_shape).T
         if value.shape != wanted:
-            problems.append(f"{name} has shape {tensors[name].shape}, but the network needs {wanted[::-1]}")
+            needed = (*wanted[::-1], *(1,) * _trailing(name)) if value.ndim > 1 else wanted
+            problems.append(f"{name} has shape {tensors[name].shape}, but the network needs {needed}")
         elif not np.isfinite(value).all():
             problems.append(f"{name} holds NaN or infinite values")
         else:
@@ -80,7 +84,8 @@ def save_released(model: tuple[nnx.GraphDef, nnx.State], path: str | Path) -> No
     """Write a model of the published structure under the authors' names.
 
     Args:
-        model: the pair (graphdef, parameters); raw inputs and a dynamic graph, as the authors' code has them.
+        model: the pair (graphdef, parameters); what the authors' file does not store (input scaling, graph,
+            neighbours, groups) must be as their code has it.
         path: .t7, .pt or .pth for a file that `torch.load` reads, .safetensors for that format.
 
     Raises:
@@ -90,20 +95,27 @@ def save_released(model: tuple[nnx.GraphDef, nnx.State], path: str | Path) -> No
     if suffix not in (*TORCH_SUFFIXES, ".safetensors"):
         raise InputError(f"{path} has no known suffix: use one of {', '.join(TORCH_SUFFIXES)} or .safetensors")
     config = Model(*model).config
-    if config.inputs != "raw" or config.graph != "dynamic":
-        raise InputError("only a model with raw inputs and a dynamic graph can be written in the authors' form")
+    same = ("normalization", "inputs", "graph", "num_neighbors", "groups")
+    other = [name for name in same if getattr(config, name) != getattr(RELEASED_CONFIG, name)]
+    if other:
+        switches = ", ".join(f"{name} = {getattr(config, name)}" for name in other)
+        raise InputError(f"the authors' code would compute something else from this model, which has {switches}")
     flat = {path: np.asarray(value[...]) for path, value in nnx.to_flat_state(model[1])}
     tensors = {}
     for name, target in _released_names().items():
         value = flat[target]
         if value.ndim == 2:
-            dims = 1 if name.split(".")[0] in _LAYERS_ON_LISTS else 2
-            value = value.T.reshape(*value.shape[::-1], *(1,) * dims)
+            value = value.T.reshape(*value.shape[::-1], *(1,) * _trailing(name))
         tensors[name] = np.ascontiguousarray(value, dtype=np.float32)
     if suffix == ".safetensors":
         write_whole(path, save(tensors))
     else:
         write_whole(path, state_dict_bytes(tensors))
+
+
+def _trailing(name: str) -> int:
+    """Return how many axes of length one a weight of the authors' has after its two of channels."""
+    return 1 if name.split(".")[0] in _LAYERS_ON_LISTS else 2
 
 
 def _released_names() -> dict[str, tuple[str, ...]]:
@@ -120,6 +132,6 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     if path.suffix == ".safetensors":
         try:
             return load_file(path)
-        except (SafetensorError, OSError) as error:
+        except (SafetensorError, OSError, AttributeError, TypeError) as error:  # the latter two: dtypes NumPy lacks
             raise InputError(f"{path} is not a readable safetensors file: {error}") from None
     return read_state_dict(path)

@@ -12,6 +12,7 @@ import pickle
 import struct
 import zipfile
 from collections import OrderedDict
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ _STORAGE_DTYPES = {
     "FloatStorage": "<f4",
     "DoubleStorage": "<f8",
     "HalfStorage": "<f2",
+    "BFloat16Storage": "<u2",  # no such NumPy type: widened by hand
     "LongStorage": "<i8",
     "IntStorage": "<i4",
     "ShortStorage": "<i2",
@@ -53,8 +55,8 @@ def read_state_dict(path: Path) -> dict[str, np.ndarray]:
         raise
     except Exception as error:  # a damaged pickle raises nearly anything: EOFError, KeyError, AttributeError, ...
         raise InputError(f"{path} is damaged: {type(error).__name__} while reading its state dict ({error})") from None
-    if isinstance(value, dict) and not any(isinstance(entry, np.ndarray) for entry in value.values()):
-        nested = [entry for key, entry in value.items() if key in ("state_dict", "model", "model_state_dict")]
+    if isinstance(value, dict):
+        nested = [value[key] for key in ("state_dict", "model_state_dict", "model") if isinstance(value.get(key), dict)]
         value = nested[0] if nested else value
     if not isinstance(value, dict) or not value or not all(isinstance(entry, np.ndarray) for entry in value.values()):
         raise InputError(f"{path} holds no state dict: save model.state_dict() rather than the model")
@@ -78,6 +80,7 @@ class _Storage:
 
     def __init__(self, name: str) -> None:
         self.dtype = np.dtype(_STORAGE_DTYPES[name])
+        self.is_bfloat16 = name == "BFloat16Storage"
 
 
 class _Unpickler(pickle.Unpickler):
@@ -105,12 +108,13 @@ class _Unpickler(pickle.Unpickler):
         values = np.frombuffer(self._archive.read(f"{self._prefix}data/{key}"), dtype=storage.dtype)
         if len(values) < count:
             raise InputError(f"{self._path} is truncated: buffer {key} holds {len(values)} of {count} values")
-        return values
+        return (values.astype(np.uint32) << 16).view(np.float32) if storage.is_bfloat16 else values
 
 
 def _tensor(storage: np.ndarray, offset: int, size: tuple, stride: tuple, *_: Any) -> np.ndarray:
     last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
-    if offset < 0 or any(n < 0 for n in size) or any(step < 0 for step in stride) or last >= max(len(storage), 1):
+    negative = offset < 0 or min((*size, *stride), default=0) < 0
+    if negative or prod(size) > len(storage) or last >= max(len(storage), 1):
         raise InputError(f"the file is damaged: a tensor of shape {tuple(size)} reaches beyond its buffer")
     steps = tuple(step * storage.itemsize for step in stride)
     return np.lib.stride_tricks.as_strided(storage[offset:], tuple(size), steps).copy()

@@ -8,10 +8,9 @@ from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from kmn_jax.checks import InputError, float_array, is_traced, mask_array, positive_scalar, rigid_pose
+from kmn_jax.checks import InputError, float_array, is_traced, mask_array, positive_scalar, rigid_pose, row_count
 from kmn_jax.geometry.knn import nearest
 from kmn_jax.geometry.se3 import (
     compose,
@@ -97,7 +96,8 @@ def icp(
     Raises InputError for wrong shapes and dtypes, values that are not finite, an initial pose that is not rigid
     and missing normals.
     """
-    object_count, scene_count = (np.shape(a)[0] if np.ndim(a) else 0 for a in (object_points, scene_points))
+    object_count = row_count(object_points, "object_points")
+    scene_count = row_count(scene_points, "scene_points")
     object_mask = mask_array(object_mask, "object_mask", object_count)
     scene_mask = mask_array(scene_mask, "scene_mask", scene_count)
     object_rows, scene_rows = (None if is_traced(m) else m for m in (object_mask, scene_mask))
@@ -112,7 +112,7 @@ def icp(
     if object_count == 0 or scene_count == 0:
         raise InputError(f"{object_count} object points and {scene_count} scene points given: both must be some")
     if scene_normals is None:
-        scene_normals = jnp.zeros((scene_count, 3))
+        scene_normals = jnp.zeros((scene_count, 3), dtype=jnp.float32)
     arrays.append(float_array(scene_normals, "scene_normals", (scene_count, 3), mask=scene_rows))
     return _icp(*(array.astype(jnp.float32) for array in arrays), object_mask, scene_mask, config)
 
@@ -129,10 +129,12 @@ def _icp(
     config: IcpConfig,
 ) -> PoseResult:
     valid = jnp.isfinite(T_scene_object).all() & jnp.isfinite(object_diameter) & (object_diameter > 0)
-    initial = jnp.where(valid, T_scene_object, jnp.eye(4))
+    initial = jnp.where(valid, T_scene_object, jnp.eye(4, dtype=jnp.float32))
     unit = jnp.where(valid, object_diameter, 1)
     object_mask = object_mask & jnp.isfinite(object_points).all(axis=1)
     scene_mask = scene_mask & jnp.isfinite(scene_points).all(axis=1) & jnp.isfinite(scene_normals).all(axis=1)
+    if config.method == "point_to_plane":  # a point without a normal measures nothing
+        scene_mask = scene_mask & (scene_normals != 0).any(axis=1)
 
     # Both clouds about the object's centre at its initial pose, in diameters: small numbers, and no unit.
     object_points = jnp.where(object_mask[:, None], object_points, 0)
@@ -164,7 +166,9 @@ def _icp(
         weights = jnp.where(inside, _robust_weight(residual / gate, config.robust), 0)
         if config.method == "point_to_plane":
             update = _plane_step(moved, normals, residual, weights)
-            pose, determined = compose(update, state.pose), jnp.array(True)
+            pose = compose(update, state.pose)
+            # A single plane leaves sliding open, which the damping holds; a line or a point leaves a turn open.
+            determined = rotation_is_determined(object_side, weights) & rotation_is_determined(scene, weights)
         else:
             pose, determined = fit_rigid(object_side, scene, weights), rotation_is_determined(object_side, weights)
         usable = determined & jnp.isfinite(pose).all() & (inside.sum(dtype=jnp.int32) >= _MIN_PAIRS)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from kmn_jax.checks import InputError, float_array, is_traced
+from kmn_jax.checks import InputError, float_array, is_traced, row_count
 from kmn_jax.geometry.eigen import dominant_eigenvector
 from kmn_jax.geometry.se3 import from_rotation_translation, quaternion_to_matrix
 from kmn_jax.typing import ArrayInput, Points, Pose, Rotation
@@ -29,9 +29,9 @@ def kabsch(source: ArrayInput, target: ArrayInput, weights: ArrayInput | None = 
 
     Method: B. K. P. Horn, Closed-form solution of absolute orientation using unit quaternions, 1987.
     """
-    count = np.shape(source)[0] if np.ndim(source) else 0
+    count = row_count(source, "source")
     if weights is None:
-        weights = jnp.ones(count)
+        weights = jnp.ones(count, dtype=jnp.float32)
     weights = float_array(weights, "weights", (count,))
     mask = None
     if not is_traced(weights):

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from kmn_jax.checks import InputError, float_array, is_traced, mask_array, positive_scalar
@@ -68,10 +67,10 @@ def find_matches(
     false never vote; neither do, under a trace, points with values that are not finite, for which outside
     of one InputError is raised, as it is for wrong shapes and dtypes. No vote at all is a mask without a true.
     """
-    shape = np.shape(keypoint_logits)
-    if len(shape) != 2 or 0 in shape:
-        raise InputError(f"keypoint_logits has shape {shape}, but must be (points, keypoints), both at least 1")
-    n, k = shape
+    keypoint_logits = float_array(keypoint_logits, "keypoint_logits", (None, None), finite=False)
+    n, k = keypoint_logits.shape
+    if 0 in (n, k):
+        raise InputError(f"keypoint_logits has shape {(n, k)}, but must be (points, keypoints), both at least 1")
     real = mask_array(mask, "mask", n)
     rows = None if is_traced(real) else real
     arrays = (

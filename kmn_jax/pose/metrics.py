@@ -12,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from kmn_jax.checks import InputError, float_array, is_traced, mask_array, rigid_pose
+from kmn_jax.checks import InputError, float_array, is_traced, mask_array, rigid_pose, row_count
+from kmn_jax.geometry.knn import squared_distances
+from kmn_jax.geometry.norms import safe_norm, safe_sqrt
 from kmn_jax.geometry.se3 import compose, from_quaternion_translation, transform_points
 from kmn_jax.typing import ArrayInput, Points, Pose, Scalar
 
@@ -72,11 +74,14 @@ def nearest_instance_error(
     `metric` is `add`, `adi` or a function like them. True poses where `mask` (i,) is false are padding; without
     a single one the error is infinite.
     """
-    truth = float_array(T_true, "T_true", (None, 4, 4))
-    mask = mask_array(mask, "mask", truth.shape[0])
-    if truth.shape[0] == 0:
-        return jnp.array(jnp.inf)
-    errors = jax.vmap(lambda pose: metric(jnp.asarray(T_estimated), pose, jnp.asarray(points)))(truth)
+    count = row_count(T_true, "T_true")
+    mask = mask_array(mask, "mask", count)
+    truth = float_array(T_true, "T_true", (None, 4, 4), mask=None if is_traced(mask) else mask)
+    if count == 0:
+        return jnp.array(jnp.inf, dtype=jnp.float32)
+    truth = jnp.where(mask[:, None, None], truth, jnp.eye(4, dtype=truth.dtype)[None])
+    estimated, points = rigid_pose(T_estimated, "T_estimated"), _some_points(points)
+    errors = jax.vmap(lambda pose: metric(estimated, pose, points))(truth)
     return jnp.where(mask, errors, jnp.inf).min()
 
 
@@ -104,10 +109,11 @@ def recall(errors: ArrayInput, size: ArrayInput, threshold: float = 0.1) -> jax.
 
     A pose that was not found counts by an infinite error. Raises InputError without a single error.
     """
-    if np.ndim(errors) != 1 or np.shape(errors)[0] == 0:
-        raise InputError(f"errors has shape {np.shape(errors)}, but must be a list of at least one")
-    if np.shape(size) not in ((), np.shape(errors)):
-        raise InputError(f"size has shape {np.shape(size)}, but must be one number or have shape {np.shape(errors)}")
+    count = row_count(errors, "errors")
+    if count == 0:
+        raise InputError("errors is empty, but a share needs at least one")
+    errors = float_array(errors, "errors", (count,), finite=False)
+    size = float_array(size, "size", (count,) if np.ndim(size) else ())
     return is_correct(errors, size, threshold).mean(dtype=jnp.float32)
 
 
@@ -126,10 +132,6 @@ def _some_points(points: ArrayInput) -> jax.Array:
     return array
 
 
-def _distances(difference: Float[Array, "... 3"]) -> Float[Array, "..."]:
-    return jnp.sqrt((difference**2).sum(axis=-1))
-
-
 def _both(T_estimated: Pose, T_true: Pose, points: Points) -> tuple[Points, Points]:
     """Return the points under both poses, relative to the centre of the true ones so that digits are not lost."""
     centre = points.mean(axis=0)
@@ -142,35 +144,29 @@ def _both(T_estimated: Pose, T_true: Pose, points: Points) -> tuple[Points, Poin
 @jax.jit
 def _add(T_estimated: Pose, T_true: Pose, points: Points) -> Scalar:
     estimated, true = _both(T_estimated, T_true, points)
-    return _distances(estimated - true).mean()
+    return safe_norm(estimated - true).mean()
 
 
 @jax.jit
 def _adi(T_estimated: Pose, T_true: Pose, points: Points) -> Scalar:
     estimated, true = _both(T_estimated, T_true, points)
-    return jnp.sqrt(_pairwise_squares(true, estimated).min(axis=1)).mean()
+    return safe_sqrt(squared_distances(true, estimated).min(axis=1)).mean()
 
 
 @jax.jit
 def _mssd(T_estimated: Pose, T_true: Pose, points: Points, symmetries: Float[Array, "s 4 4"]) -> Scalar:
-    symmetries = jnp.concatenate([jnp.eye(4)[None], symmetries.astype(jnp.float32)])
+    symmetries = jnp.concatenate([jnp.eye(4, dtype=jnp.float32)[None], symmetries.astype(jnp.float32)])
 
     def largest(symmetry: Pose) -> Scalar:
         estimated, true = transform_points(T_estimated, points), transform_points(compose(T_true, symmetry), points)
-        return _distances(estimated - true).max()
+        return safe_norm(estimated - true).max()
 
     return jax.vmap(largest)(symmetries).min()
 
 
 @jax.jit
 def _diameter(points: Points) -> Scalar:
-    return jnp.sqrt(_pairwise_squares(points, points).max())
-
-
-def _pairwise_squares(a: Float[Array, "n 3"], b: Float[Array, "m 3"]) -> Float[Array, "n m"]:
-    """Return exact squared distances coordinate by coordinate: they fuse into a reduction and are never stored."""
-    x, y, z = (a[:, i, None] - b[None, :, i] for i in range(3))
-    return x * x + y * y + z * z
+    return jnp.sqrt(squared_distances(points, points).max())
 
 
 def _turns(axis: Float[Array, "3"], offset: Float[Array, "3"], count: int) -> Float[Array, "c 4 4"]:

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from kmn_jax.checks import InputError, float_array, is_traced, mask_array, positive_scalar
+from kmn_jax.checks import InputError, float_array, is_traced, mask_array, positive_scalar, row_count
 from kmn_jax.geometry.se3 import from_rotation_translation
 from kmn_jax.pose.kabsch import fit_rigid, rotation_is_determined
 from kmn_jax.pose.matches import Matches
 from kmn_jax.pose.result import PoseResult, PoseStatus
-from kmn_jax.typing import Mask, Normals, Points, Pose, PRNGKey, Scalar
+from kmn_jax.typing import ArrayInput, Mask, Normals, Points, Pose, PRNGKey, Scalar
 
 _MIN_HEIGHT = 0.01  # of the diameter: a flatter triangle says nothing about the rotation about its long side
 
@@ -70,7 +70,7 @@ class RansacConfig:
         return cos(radians(self.normal_gate_degrees))
 
 
-def ransac(key: jax.Array, matches: Matches, config: RansacConfig = RansacConfig()) -> PoseResult:
+def ransac(key: ArrayInput, matches: Matches, config: RansacConfig = RansacConfig()) -> PoseResult:
     """Return the pose that most matches agree on, as a pure function: the same key gives the same bits.
 
     Draw triplets of matches, keep those whose object and scene triangles are most congruent, fit a pose to each,
@@ -91,7 +91,7 @@ def ransac(key: jax.Array, matches: Matches, config: RansacConfig = RansacConfig
     return result._replace(inlier_mask=result.inlier_mask[:0])
 
 
-def _checked_key(key: jax.Array) -> jax.Array:
+def _checked_key(key: ArrayInput) -> jax.Array:
     typed = isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ()
     raw = isinstance(key, jax.Array | np.ndarray) and key.dtype == jnp.uint32 and key.shape == (2,)
     if not (typed or raw):
@@ -102,8 +102,7 @@ def _checked_key(key: jax.Array) -> jax.Array:
 def _checked_matches(matches: Matches) -> Matches:
     if not isinstance(matches, Matches):
         raise InputError(f"matches is a {type(matches).__name__}, but must be Matches: see find_matches")
-    shape = np.shape(matches.object_points)
-    count = shape[0] if shape else 0
+    count = row_count(matches.object_points, "matches.object_points")
     mask = mask_array(matches.mask, "matches.mask", count)
     rows = None if is_traced(mask) else mask
 
@@ -121,7 +120,7 @@ def _checked_matches(matches: Matches) -> Matches:
         scene_normals=checked("scene_normals", 3),
         weights=weights,
         mask=mask,
-        overflow=jnp.asarray(matches.overflow),
+        overflow=jnp.asarray(matches.overflow, dtype=bool),
         object_diameter=positive_scalar(matches.object_diameter, "matches.object_diameter").astype(jnp.float32),
     )
 
@@ -190,7 +189,7 @@ def _ransac(key: PRNGKey, matches: Matches, config: RansacConfig) -> PoseResult:
     converged = status == PoseStatus.OK
     squared_error = jnp.where(inlier_mask, squares, 0).sum() / jnp.maximum(num_inliers, 1).astype(jnp.float32)
     return PoseResult(
-        T_scene_object=jnp.where(converged, pose, jnp.eye(4)),
+        T_scene_object=jnp.where(converged, pose, jnp.eye(4, dtype=jnp.float32)),
         score=jnp.where(converged, num_inliers / jnp.maximum(num_usable, 1), 0),
         num_inliers=jnp.where(converged, num_inliers, 0),
         rms_error=jnp.where(converged, unit * jnp.sqrt(squared_error), 0),

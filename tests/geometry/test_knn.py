@@ -125,3 +125,17 @@ def test_k_nearest_keeps_its_digits_far_from_the_origin() -> None:
     exact = ((points[:, None].astype(np.float64) - points[None]) ** 2).sum(axis=-1)
     want = np.sort(np.argsort(exact, axis=1)[:, :20])
     np.testing.assert_array_equal(np.sort(k_nearest(jnp.asarray(points), jnp.asarray(points), 20)), want)
+
+
+def test_tight_clusters_far_apart_keep_their_own() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(60, 3)) * 1e-2 + np.where(np.arange(60)[:, None] < 30, 1000, -1000)
+    points = points.astype(np.float32)
+    exact = ((points[:, None].astype(np.float64) - points[None]) ** 2).sum(axis=-1)
+    found = np.asarray(k_nearest(jnp.asarray(points), jnp.asarray(points), 5))
+    np.testing.assert_array_equal(np.sort(found), np.sort(np.argsort(exact, axis=1)[:, :5]))
+    assert all(row in found[row] for row in range(60))
+
+
+def test_no_queries_have_no_neighbours() -> None:
+    assert k_nearest(jnp.zeros((0, 3)), jnp.zeros((9, 3)), 5).shape == (0, 5)

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from dataclasses import asdict
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -192,6 +195,9 @@ def test_parameter_count_is_the_published_one() -> None:
     [
         ({"edge_width": 33}, "multiple of groups"),
         ({"groups": 0}, "at least 1"),
+        ({"num_neighbors": 2.5}, "whole number"),
+        ({"compute": "float16"}, "one of float32, tf32, bfloat16"),
+        ({"normalization": "relased"}, "one of metric, released"),
         ({"dropout": 1.0}, r"in \[0, 1\)"),
         ({"inputs": "invariant", "normalization": "released"}, 'need normalization "metric"'),
         ({"num_keypoints": 50, "num_object_points": 40}, "cannot be drawn"),
@@ -199,7 +205,7 @@ def test_parameter_count_is_the_published_one() -> None:
 )
 def test_contradictory_configs_are_refused(changes: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        KeyMatchNetConfig(**changes)
+        KeyMatchNetConfig.__post_init__(SimpleNamespace(**(asdict(KeyMatchNetConfig()) | changes)))
 
 
 def test_bad_input_gets_one_clear_error() -> None:
@@ -231,6 +237,13 @@ def test_bad_input_gets_one_clear_error() -> None:
         (lambda: encode_object(model, np.ones_like(cloud), KEYPOINTS), "no extent"),
         (lambda: match(model, crop, part), "scene_width"),
         (lambda: match(model, encode_scene(model, crop) * np.nan, part), "NaN"),
+        (lambda: match(model, encode_scene(model, crop), part._replace(features=part.features * np.nan)), "NaN"),
+        (lambda: match(model, encode_scene(model, crop), part._replace(features=part.features[None])), "shape"),
+        (lambda: match(model, encode_scene(model, crop), crop), "must come from encode_object"),
+        (lambda: encode_scene(None, crop), r"the pair \(graphdef, parameters\)"),
+        (lambda: encode_scene(model, [[1.0] * 6, [1.0] * 5], mask=[True, True]), "not an array"),
+        (lambda: encode_scene(model, crop * np.float32(1e25)), "too large for float32"),
+        (lambda: encode_object(model, cloud * np.float32(1e25), KEYPOINTS), "too large for float32"),
     ]
     for call, message in cases:
         with pytest.raises(InputError, match=message):

@@ -75,3 +75,15 @@ def test_weights_are_checked() -> None:
     for weights in ((-1.0, 1.0), (0.0, 0.0)):
         with pytest.raises(ValueError, match="loss weights"):
             LossConfig(*weights)
+
+
+def test_padding_reaches_neither_loss_nor_gradient() -> None:
+    segmentation, keypoint, on_object, labels = map(jnp.asarray, example(6))
+    mask = jnp.arange(60) < 41
+
+    def total(logits: jax.Array) -> jax.Array:
+        return matching_loss(segmentation, logits, on_object, labels, mask).total
+
+    broken = jnp.where(mask[:, None], keypoint, jnp.nan)
+    np.testing.assert_allclose(total(broken), total(keypoint), rtol=1e-6)
+    np.testing.assert_allclose(jax.grad(total)(broken), jax.grad(total)(keypoint), atol=1e-7)

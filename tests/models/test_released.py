@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pickle
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -87,9 +88,10 @@ def test_own_format_round_trip(tmp_path: Path) -> None:
 
 
 def test_only_what_the_authors_code_has_is_written_in_its_form(tmp_path: Path) -> None:
-    for changes in ({"inputs": "invariant"}, {"graph": "static"}):
-        with pytest.raises(InputError, match="authors' form"):
-            save_released(create_model(KeyMatchNetConfig(**changes), jax.random.key(0)), tmp_path / "a.pt")
+    for changes in ({"graph": "static"}, {"num_neighbors": 10}, {"normalization": "metric"}):
+        config = replace(RELEASED_CONFIG, **changes)
+        with pytest.raises(InputError, match=f"something else .* {next(iter(changes))}"):
+            save_released(create_model(config, jax.random.key(0)), tmp_path / "a.pt")
     with pytest.raises(InputError, match="no known suffix"):
         save_released(create_model(RELEASED_CONFIG, jax.random.key(0)), tmp_path / "a.onnx")
 
@@ -104,7 +106,10 @@ def test_wrong_contents_are_named(tensors: dict[str, np.ndarray], tmp_path: Path
     cases = [
         (changed(**{"conv8r.0.weight": None}), "conv8r.0.weight is missing"),
         (changed(extra=np.ones(3, "f4")), "extra is unknown"),
-        (changed(**{"conv6.0.weight": np.ones((512, 192, 1), "f4")}), r"conv6.0.weight has shape \(512, 192, 1\)"),
+        (
+            changed(**{"conv6.0.weight": np.ones((512, 192, 1), "f4")}),
+            r"conv6.0.weight has shape \(512, 192, 1\), but the network needs \(1024, 192, 1\)",
+        ),
         (changed(**{"conv9.0.weight": np.ones((2, 256, 3), "f4")}), r"conv9.0.weight has shape \(2, 256, 3\)"),
         (changed(**{"conv1.1.bias": broken}), "conv1.1.bias holds NaN"),
         ({"a": np.ones(3, "f4")}, "and [0-9]+ more"),
@@ -235,14 +240,25 @@ def test_torch_reads_what_we_write(tmp_path: Path) -> None:
 
 @pytest.mark.torch
 def test_torch_files_of_other_layouts(tmp_path: Path) -> None:
-    """Wrapped in a dict, saved as Parameters, in half precision, as views of one buffer."""
+    """Wrapped in a dict beside other things, saved as Parameters, in half precision, as views of one buffer."""
     import torch
 
     base = torch.arange(24, dtype=torch.float32).reshape(4, 6)
     torch.save(
-        {"state_dict": {"view": base[1:3, ::2], "half": base.half(), "p": torch.nn.Parameter(base)}}, tmp_path / "a.pt"
+        {
+            "epoch": 3,
+            "loss": base.sum(),
+            "state_dict": {
+                "bf16": base.bfloat16(),
+                "view": base[1:3, ::2],
+                "half": base.half(),
+                "p": torch.nn.Parameter(base),
+            },
+        },
+        tmp_path / "a.pt",
     )
     tensors = read_state_dict(tmp_path / "a.pt")
     np.testing.assert_array_equal(tensors["view"], base[1:3, ::2].numpy())
     np.testing.assert_array_equal(tensors["half"], base.numpy())
     np.testing.assert_array_equal(tensors["p"], base.numpy())
+    np.testing.assert_array_equal(tensors["bf16"], base.numpy())

@@ -199,3 +199,25 @@ def test_bad_input_is_named():
 def test_config_refuses_contradictions(change):
     with pytest.raises(ValueError, match=next(iter(change))):
         IcpConfig(**change)
+
+
+@pytest.mark.parametrize("case", ["one object point", "one scene point", "scene on a line", "no normals"])
+def test_what_fixes_no_pose_is_no_success(case: str) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(100, 3)).astype(np.float32)
+    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    scene, scene_normals = points + np.float32(0.01), normals
+    match case:
+        case "one object point":
+            points = np.zeros((1, 3), np.float32)
+            scene = scene * np.float32(0.01)
+        case "one scene point":
+            scene, scene_normals = np.tile(points[:1], (100, 1)), np.tile(normals[:1], (100, 1))
+        case "scene on a line":
+            points = np.linspace(0, 1, 100, dtype=np.float32)[:, None] * np.float32([[1, 2, 3]])
+            scene = points
+        case "no normals":
+            scene_normals = normals * 0
+    result = icp(points, scene, np.eye(4), 3.0, scene_normals)
+    assert not bool(result.converged)
+    np.testing.assert_array_equal(result.T_scene_object, np.eye(4))

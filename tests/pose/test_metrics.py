@@ -115,7 +115,7 @@ def test_recall():
     assert recall(errors, 1.0) == pytest.approx(0.2)
     assert recall(errors, 1.0, threshold=0.15) == pytest.approx(0.4)
     assert recall(errors, jnp.array([0.1, 2, 3, 4, 5])) == pytest.approx(0.4)
-    with pytest.raises(InputError, match="errors has shape"):
+    with pytest.raises(InputError, match="errors is empty"):
         recall(jnp.zeros(0), 1.0)
     with pytest.raises(InputError, match="size has shape"):
         recall(errors, jnp.ones(3))
@@ -148,3 +148,15 @@ def test_bad_input_is_named(metric):
         metric(estimated, true, points.astype(jnp.int32))
     with pytest.raises(InputError, match="points is empty"):
         diameter(points[:0])
+
+
+@pytest.mark.parametrize("metric", [add, adi, mssd])
+def test_gradient_is_finite_at_the_true_pose(metric):
+    points = jnp.asarray(np.random.default_rng(0).normal(size=(30, 3)), "f4")
+    assert bool(jnp.isfinite(jax.grad(lambda pose: metric(pose, jnp.eye(4), points))(jnp.eye(4))).all())
+
+
+def test_padded_true_poses_may_hold_anything():
+    points = np.random.default_rng(0).normal(size=(30, 3)).astype("f4")
+    poses = np.stack([np.eye(4), np.full((4, 4), np.nan)])
+    assert nearest_instance_error(add, np.eye(4), poses, points, mask=[True, False]) == pytest.approx(0, abs=1e-6)
