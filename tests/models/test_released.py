@@ -244,19 +244,8 @@ def test_torch_files_of_other_layouts(tmp_path: Path) -> None:
     import torch
 
     base = torch.arange(24, dtype=torch.float32).reshape(4, 6)
-    torch.save(
-        {
-            "epoch": 3,
-            "loss": base.sum(),
-            "state_dict": {
-                "bf16": base.bfloat16(),
-                "view": base[1:3, ::2],
-                "half": base.half(),
-                "p": torch.nn.Parameter(base),
-            },
-        },
-        tmp_path / "a.pt",
-    )
+    views = {"view": base[1:3, ::2], "half": base.half(), "bf16": base.bfloat16(), "p": torch.nn.Parameter(base)}
+    torch.save({"epoch": 3, "loss": base.sum(), "state_dict": views}, tmp_path / "a.pt")
     tensors = read_state_dict(tmp_path / "a.pt")
     np.testing.assert_array_equal(tensors["view"], base[1:3, ::2].numpy())
     np.testing.assert_array_equal(tensors["half"], base.numpy())
