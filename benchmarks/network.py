@@ -150,19 +150,22 @@ def memory_rows() -> list[dict[str, Any]]:
 
 def _encode_objects(graphdef: nnx.GraphDef, parameters: nnx.State, case: Case) -> jax.Array:
     network = nnx.merge(graphdef, parameters)
-    return jax.vmap(lambda cloud: network.encode_object(cloud, case.keypoint_indices, case.length))(case.clouds)
+    return _each(lambda cloud: network.encode_object(cloud, case.keypoint_indices, case.length), case.clouds)
 
 
 def _cached(graphdef: nnx.GraphDef, parameters: nnx.State, crops: jax.Array, parts: jax.Array) -> Any:
     network = nnx.merge(graphdef, parameters)
     length = jnp.float32(1)
 
-    def one(crop: jax.Array, part: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return network.match(network.encode_scene(crop, length), part)
+    def one(pair: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        return network.match(network.encode_scene(pair[0], length), pair[1])
 
-    if jax.default_backend() == "cpu":  # one crop fills two cores; a batch of them only outgrows the caches
-        return jax.lax.map(lambda pair: one(*pair), (crops, parts))
-    return jax.vmap(one)(crops, parts)
+    return _each(one, (crops, parts))
+
+
+def _each(function: Callable[[Any], Any], batch: Any) -> Any:
+    """Batch by vmap; on CPUs one after the other, as one crop fills the cores and many only outgrow the caches."""
+    return jax.lax.map(function, batch) if jax.default_backend() == "cpu" else jax.vmap(function)(batch)
 
 
 def _whole(graphdef: nnx.GraphDef, parameters: nnx.State, case: Case) -> Any:
