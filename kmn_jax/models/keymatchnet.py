@@ -12,7 +12,6 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
@@ -34,6 +33,8 @@ from kmn_jax.typing import ArrayInput
 
 Normalization = Literal["metric", "released"]
 Inputs = Literal["raw", "invariant"]
+
+_LARGEST = 1e18  # a length whose square, summed over three axes, still fits float32
 
 _CHOICES = {
     "normalization": get_args(Normalization),
@@ -248,9 +249,9 @@ def encode_object(
     if indices.shape[0] < 1:
         raise InputError("keypoint_indices is empty: choose at least one keypoint")
     graphdef, parameters = _pair(model)
-    extent = object_extent(cloud[:, :3])
-    _check_extent(extent, "object_cloud")
-    return _encode_object(graphdef, parameters, cloud, indices, _length(length, extent))
+    _check_extent(jnp.ptp(cloud[:, :3], axis=0).max(), "object_cloud")
+    length = _object_extent(cloud[:, :3]) if length is None else positive_scalar(length, "length")
+    return _encode_object(graphdef, parameters, cloud, indices, length.astype(jnp.float32))
 
 
 def encode_scene(
@@ -280,10 +281,10 @@ def encode_scene(
     if given is not None and not is_traced(given) and not bool(given.any()):
         raise InputError("mask is all false: scene_crop has no real point")
     graphdef, parameters = _pair(model)
-    distance = jnp.sqrt((crop[:, :3] ** 2).sum(axis=1))
-    extent = (distance if given is None else jnp.where(given, distance, 0)).max()
-    _check_extent(extent, "scene_crop")
-    return _encode_scene(graphdef, parameters, crop, _length(length, extent), given)
+    radius = _crop_radius(crop, given)
+    _check_extent(radius, "scene_crop")
+    length = radius if length is None else positive_scalar(length, "length")
+    return _encode_scene(graphdef, parameters, crop, length.astype(jnp.float32), given)
 
 
 def match(
@@ -360,8 +361,13 @@ def _pair(model: Any) -> tuple[nnx.GraphDef, nnx.State]:
     return model
 
 
-def _length(given: ArrayInput | None, extent: Float[Array, ""]) -> Float[Array, ""]:
-    return extent if given is None else positive_scalar(given, "length").astype(jnp.float32)
+_object_extent = jax.jit(object_extent)
+
+
+@jax.jit
+def _crop_radius(crop: Float[Array, "n 6"], mask: Bool[Array, " n"] | None) -> Float[Array, ""]:
+    distance = jnp.sqrt((crop[:, :3] ** 2).sum(axis=1))
+    return (distance if mask is None else jnp.where(mask, distance, 0)).max()
 
 
 def _check_extent(extent: Float[Array, ""], name: str) -> None:
@@ -369,7 +375,7 @@ def _check_extent(extent: Float[Array, ""], name: str) -> None:
         return
     if float(extent) == 0:
         raise InputError(f"{name} has no extent: all of its points coincide")
-    if not np.isfinite(float(extent)):
+    if not float(extent) < _LARGEST:
         raise InputError(f"{name} is too large for float32: use a larger unit of length")
 
 
