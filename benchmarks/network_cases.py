@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from kmn_jax.models import RELEASED_CONFIG, KeyMatchNet, Model, create_model, save_released
+from kmn_jax.models import RELEASED_CONFIG, Model, create_model, model_structure, save_released
 from kmn_jax.models.layers import Compute
 from kmn_jax.models.normalization import released_object, released_scene
 from tests.reference import dense_jax
@@ -36,8 +36,7 @@ class Case(NamedTuple):
     def with_compute(self, compute: Compute) -> Model:
         """The same network in another arithmetic."""
         config = replace(RELEASED_CONFIG, compute=compute)
-        graphdef = nnx.split(nnx.eval_shape(lambda: KeyMatchNet(config, rngs=nnx.Rngs(0))))[0]
-        return Model(graphdef, self.parameters)
+        return Model(model_structure(config).graphdef, self.parameters)
 
     def first(self) -> Case:
         """The first example alone, as a batch of one."""

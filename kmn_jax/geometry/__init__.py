@@ -2,7 +2,7 @@
 
 from kmn_jax.geometry.crop import Selection, radius_crop, voxel_thin
 from kmn_jax.geometry.eigen import dominant_eigenvector
-from kmn_jax.geometry.knn import k_nearest, nearest, squared_distances
+from kmn_jax.geometry.knn import k_nearest, largest_distance, nearest, squared_distances
 from kmn_jax.geometry.normals import depth_normals, depth_to_points, estimate_normals, orient_to_camera
 from kmn_jax.geometry.sampling import farthest_point_indices
 from kmn_jax.geometry.se3 import (
@@ -33,6 +33,7 @@ __all__ = [
     "from_rotation_translation",
     "inverse",
     "k_nearest",
+    "largest_distance",
     "matrix_to_quaternion",
     "nearest",
     "orient_to_camera",

@@ -87,6 +87,11 @@ def nearest(
     return jnp.argmin(distances, axis=-1), jnp.sqrt(distances.min(axis=-1))
 
 
+def largest_distance(points: Float[Array, "n c"]) -> Float[Array, ""]:
+    """Return the largest distance between any two points; time grows with the square of their number."""
+    return jnp.sqrt(squared_distances(points, points).max())
+
+
 def _centered(
     queries: Float[Array, "n c"], points: Float[Array, "m c"], mask: Bool[Array, " m"] | None
 ) -> tuple[Float[Array, "n c"], Float[Array, "m c"]]:

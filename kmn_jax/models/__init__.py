@@ -9,6 +9,7 @@ from kmn_jax.models.keymatchnet import (
     encode_object,
     encode_scene,
     match,
+    model_structure,
 )
 from kmn_jax.models.losses import LossConfig, MatchingLoss, keypoint_labels, matching_loss
 from kmn_jax.models.released import RELEASED_CONFIG, load_released, save_released
@@ -30,6 +31,7 @@ __all__ = [
     "load_released",
     "match",
     "matching_loss",
+    "model_structure",
     "save_model",
     "save_released",
 ]

@@ -16,6 +16,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
 from kmn_jax.checks import InputError, float_array, index_array, is_traced, mask_array, positive_scalar, row_count
+from kmn_jax.geometry.knn import largest_distance
 from kmn_jax.models.encoder import Encoder, Graph
 from kmn_jax.models.invariants import (
     NUM_OBJECT_INVARIANTS,
@@ -27,7 +28,7 @@ from kmn_jax.models.invariants import (
     scene_invariants,
 )
 from kmn_jax.models.layers import Compute, NormalizedLinear, dropout
-from kmn_jax.models.normalization import metric_object, metric_scene, object_extent, released_object, released_scene
+from kmn_jax.models.normalization import metric_object, metric_scene, released_object, released_scene
 from kmn_jax.models.pair_head import PairDropout, PairHead
 from kmn_jax.typing import ArrayInput
 
@@ -227,6 +228,11 @@ def create_model(config: KeyMatchNetConfig, key: jax.Array) -> Model:
     return Model(*nnx.split(KeyMatchNet(config, rngs=nnx.Rngs(params=key))))
 
 
+def model_structure(config: KeyMatchNetConfig) -> Model:
+    """Return a network with shapes in place of parameters: what loaded arrays are put into."""
+    return Model(*nnx.split(nnx.eval_shape(lambda: KeyMatchNet(config, rngs=nnx.Rngs(0)))))
+
+
 def encode_object(
     model: ModelPair,
     object_cloud: ArrayInput,
@@ -250,7 +256,7 @@ def encode_object(
         raise InputError("keypoint_indices is empty: choose at least one keypoint")
     graphdef, parameters = _pair(model)
     _check_extent(jnp.ptp(cloud[:, :3], axis=0).max(), "object_cloud")
-    length = _object_extent(cloud[:, :3]) if length is None else positive_scalar(length, "length")
+    length = _diameter(cloud[:, :3]) if length is None else positive_scalar(length, "length")
     return _encode_object(graphdef, parameters, cloud, indices, length.astype(jnp.float32))
 
 
@@ -361,7 +367,7 @@ def _pair(model: Any) -> tuple[nnx.GraphDef, nnx.State]:
     return model
 
 
-_object_extent = jax.jit(object_extent)
+_diameter = jax.jit(largest_distance)
 
 
 @jax.jit

@@ -5,14 +5,6 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from kmn_jax.geometry.knn import squared_distances
-
-
-def object_extent(points: Float[Array, "m 3"]) -> Float[Array, ""]:
-    """Return the diameter: the largest distance between two points."""
-    centered = points - points.mean(axis=0)[None, :]
-    return jnp.sqrt(squared_distances(centered, centered).max())
-
 
 def metric_object(cloud: Float[Array, "m 6"], length: Float[Array, ""]) -> Float[Array, "m 6"]:
     """Centre the points on their mean and divide them by `length`; unit normals stay as they are."""

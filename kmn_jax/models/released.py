@@ -12,7 +12,7 @@ from safetensors.numpy import load_file, save
 
 from kmn_jax.checks import InputError
 from kmn_jax.files import write_whole
-from kmn_jax.models.keymatchnet import KeyMatchNet, KeyMatchNetConfig, Model
+from kmn_jax.models.keymatchnet import KeyMatchNetConfig, Model, model_structure
 from kmn_jax.models.torch_file import read_state_dict, state_dict_bytes
 
 RELEASED_CONFIG = KeyMatchNetConfig(normalization="released", pair_dropout="per_pair")
@@ -54,7 +54,7 @@ def load_released(path: str | Path, config: KeyMatchNetConfig = RELEASED_CONFIG)
     tensors = {name.removeprefix("module."): tensor for name, tensor in stored.items()}
     if len(tensors) < len(stored):
         raise InputError(f"{path} holds some names both with and without the prefix module.: keep one of the two")
-    graphdef, parameters = nnx.split(nnx.eval_shape(lambda: KeyMatchNet(config, rngs=nnx.Rngs(0))))
+    graphdef, parameters = model_structure(config)
     flat = dict(nnx.to_flat_state(parameters))
     names = _released_names()
     problems = [f"{name} is missing" for name in names if name not in tensors]

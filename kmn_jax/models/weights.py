@@ -14,7 +14,7 @@ from safetensors.numpy import save
 
 from kmn_jax.checks import InputError
 from kmn_jax.files import write_whole
-from kmn_jax.models.keymatchnet import KeyMatchNet, KeyMatchNetConfig, Model
+from kmn_jax.models.keymatchnet import KeyMatchNetConfig, Model, model_structure
 
 _CONFIG_KEY = "kmn_jax.config"
 
@@ -55,7 +55,7 @@ def load_model(path: str | Path) -> Model:
         config = KeyMatchNetConfig(**json.loads(metadata[_CONFIG_KEY]))
     except (TypeError, ValueError) as error:
         raise InputError(f"{path} has a config that this version of kmn_jax cannot use: {error}") from None
-    graphdef, parameters = nnx.split(nnx.eval_shape(lambda: KeyMatchNet(config, rngs=nnx.Rngs(0))))
+    graphdef, parameters = model_structure(config)
     flat = dict(nnx.to_flat_state(parameters))
     wanted = {".".join(map(str, target)): target for target in flat}
     problems = [f"{name} is missing" for name in wanted if name not in tensors]

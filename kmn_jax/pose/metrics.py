@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from kmn_jax.checks import InputError, float_array, is_traced, mask_array, rigid_pose, row_count
-from kmn_jax.geometry.knn import squared_distances
+from kmn_jax.geometry.knn import largest_distance, squared_distances
 from kmn_jax.geometry.norms import safe_norm, safe_sqrt
 from kmn_jax.geometry.se3 import compose, from_quaternion_translation, transform_points
 from kmn_jax.typing import ArrayInput, Points, Pose, Scalar
@@ -164,9 +164,7 @@ def _mssd(T_estimated: Pose, T_true: Pose, points: Points, symmetries: Float[Arr
     return jax.vmap(largest)(symmetries).min()
 
 
-@jax.jit
-def _diameter(points: Points) -> Scalar:
-    return jnp.sqrt(squared_distances(points, points).max())
+_diameter = jax.jit(largest_distance)
 
 
 def _turns(axis: Float[Array, "3"], offset: Float[Array, "3"], count: int) -> Float[Array, "c 4 4"]:
