@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from typing import Any, TypeAlias
 
-from jaxtyping import Array, Bool, Float, Int, Key, UInt32
+from jaxtyping import Array, Bool, Float, Key, UInt32
 
 Points = Float[Array, "n 3"]
 Normals = Float[Array, "n 3"]
-PointNormals = Float[Array, "n 6"]
-Features = Float[Array, "n c"]
 Mask = Bool[Array, " n"]
-Indices = Int[Array, " n"]
-NeighborIndices = Int[Array, "n k"]
 Pose = Float[Array, "4 4"]
 Rotation = Float[Array, "3 3"]
 Quaternion = Float[Array, "4"]

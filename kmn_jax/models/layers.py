@@ -72,12 +72,17 @@ class ChannelAffine(NamedTuple):
         return x.astype(jnp.float32) * self.scale.reshape(row) + self.shift.reshape(row)
 
 
+def drawn_kernel(in_features: int, out_features: int, rngs: nnx.Rngs) -> Float[Array, "i o"]:
+    """Draw initial weights from U(-1/sqrt(i), 1/sqrt(i)), as the published code's layers start."""
+    initializer = nnx.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
+    return initializer(rngs.params(), (in_features, out_features), jnp.float32)
+
+
 class NormalizedLinear(nnx.Module):
     """A bias-free linear map with the parameters of the GroupNorm that follows it."""
 
     def __init__(self, in_features: int, out_features: int, groups: int, *, rngs: nnx.Rngs) -> None:
-        initializer = nnx.initializers.variance_scaling(1 / 3, "fan_in", "uniform")  # U(-1/sqrt(i), 1/sqrt(i))
-        self.kernel = nnx.Param(initializer(rngs.params(), (in_features, out_features), jnp.float32))
+        self.kernel = nnx.Param(drawn_kernel(in_features, out_features, rngs))
         self.norm_scale = nnx.Param(jnp.ones(out_features))
         self.norm_bias = nnx.Param(jnp.zeros(out_features))
         self.groups = groups

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
-from kmn_jax.models.layers import Compute, NormalizedLinear, channel_moments, dropout, leaky_relu, product
+from kmn_jax.models.layers import Compute, NormalizedLinear, channel_moments, drawn_kernel, dropout, leaky_relu, product
 
 PairDropout = Literal["shared", "per_pair"]
 
@@ -29,9 +29,8 @@ class PairHead(nnx.Module):
     def __init__(self, scene_width: int, object_width: int, width: int, groups: int, *, rngs: nnx.Rngs) -> None:
         self.scene_pair = NormalizedLinear(scene_width + object_width, width, groups, rngs=rngs)
         self.context_pair = NormalizedLinear(width + object_width, width, groups, rngs=rngs)
-        initializer = nnx.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
-        self.segmentation = nnx.Param(initializer(rngs.params(), (width, 2), jnp.float32))
-        self.keypoint = nnx.Param(initializer(rngs.params(), (width, 1), jnp.float32))
+        self.segmentation = nnx.Param(drawn_kernel(width, 2, rngs))
+        self.keypoint = nnx.Param(drawn_kernel(width, 1, rngs))
 
     def __call__(
         self,

@@ -7,13 +7,13 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save
+from safetensors.numpy import save
 
 from kmn_jax.checks import InputError
 from kmn_jax.files import write_whole
 from kmn_jax.models.keymatchnet import KeyMatchNetConfig, Model, model_structure
 from kmn_jax.models.torch_file import read_state_dict, state_dict_bytes
+from kmn_jax.models.weights import read_safetensors
 
 RELEASED_CONFIG = KeyMatchNetConfig(normalization="released", pair_dropout="per_pair")
 
@@ -130,8 +130,5 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise InputError(f"{path} does not exist or is not a file")
     if path.suffix == ".safetensors":
-        try:
-            return load_file(path)
-        except (SafetensorError, OSError, AttributeError, TypeError) as error:  # the latter two: dtypes NumPy lacks
-            raise InputError(f"{path} is not a readable safetensors file: {error}") from None
+        return read_safetensors(path)[0]
     return read_state_dict(path)

@@ -37,18 +37,23 @@ def is_model_file(path: str | Path) -> bool:
         return False
 
 
+def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Return tensors and header of a .safetensors file, or raise InputError."""
+    try:
+        with safe_open(str(path), "np") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a mapping)
+            return tensors, file.metadata() or {}
+    except (SafetensorError, OSError, AttributeError, TypeError) as error:  # the latter two: dtypes NumPy lacks
+        raise InputError(f"{path} is not a readable safetensors file: {error}") from None
+
+
 def load_model(path: str | Path) -> Model:
     """Load a model that `save_model` wrote.
 
     Raises:
         InputError: missing or damaged file, not one of ours, or a config that this version does not know.
     """
-    try:
-        with safe_open(str(path), "np") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a mapping)
-    except (SafetensorError, OSError) as error:
-        raise InputError(f"{path} is not a readable model file: {error}") from None
+    tensors, metadata = read_safetensors(path)
     if _CONFIG_KEY not in metadata:
         raise InputError(f"{path} carries no kmn_jax config: if it holds published weights, use load_released")
     try:
