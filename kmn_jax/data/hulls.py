@@ -1,0 +1,220 @@
+"""Convex collision shapes: a few coarse convex parts of an object, and the mass properties of their union."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from kmn_jax.checks import InputError
+
+STEP_SHARE = 1e-3  # a cut runs this share of the diagonal beside a flat face, so that the face falls to one side
+
+
+@dataclass(frozen=True)
+class HullConfig:
+    """How an object is cut into convex parts. Lengths are shares of its diagonal, volumes of its convex hull.
+
+    Parts thinner than `thickness` jam or tunnel in simulation, whatever its step, so no cut makes one: an object whose
+    pins or sheets are thinner keeps them inside of a thicker part.
+    """
+
+    parts: int = 8
+    thickness: float = 0.1
+    gain: float = 0.02  # a cut must empty this share of the volume
+    faces: int = 6  # cuts tried a direction: beside its largest flat faces, ...
+    spaced: int = 3  # ... and evenly spaced
+
+    def __post_init__(self) -> None:
+        if self.parts < 1 or self.faces < 0 or self.spaced < 0:
+            raise InputError(f"hulls: parts = {self.parts} must be 1 or more, faces and spaced 0 or more")
+        if not 0 < self.thickness < 1 or not 0 < self.gain < 1:
+            raise InputError(f"hulls: thickness = {self.thickness} and gain = {self.gain} must lie between 0 and 1")
+
+
+@dataclass(frozen=True)
+class CollisionShape:
+    """What physics needs to know of an object: convex parts, in the object's frame and unit, and how mass is spread.
+
+    `inertia` is that of unit mass about the centre, along the columns of the rotation `R_object_principal`.
+    """
+
+    parts: tuple[Float[np.ndarray, "_ 3"], ...]
+    diagonal: float
+    volume: float
+    center: Float[np.ndarray, "3"]
+    R_object_principal: Float[np.ndarray, "3 3"]
+    inertia: Float[np.ndarray, "3"]
+
+
+class _Piece(NamedTuple):
+    triangles: np.ndarray  # (t, 3, 3) corners
+    hull: Any  # scipy.spatial.ConvexHull
+
+
+def collision_shape(
+    vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], config: HullConfig = HullConfig()
+) -> CollisionShape:
+    """Return the convex parts of a surface and the mass properties of their union, for `settle`.
+
+    Raises:
+        InputError: the surface is empty, not finite, or flat.
+    """
+    parts = collision_hulls(vertices, triangles, config)
+    corners = np.asarray(vertices, dtype=np.float64)[np.unique(triangles)]
+    diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
+    volume, center, inertia = _mass_properties(parts)
+    moments, axes = np.linalg.eigh(inertia)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    return CollisionShape(tuple(parts), diagonal, volume, center, axes, moments / volume)
+
+
+def collision_hulls(
+    vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], config: HullConfig = HullConfig()
+) -> list[Float[np.ndarray, "_ 3"]]:
+    """Cut a surface along its frame's axes where that empties most volume; return the corners of the parts' hulls.
+
+    The surface need be neither closed nor consistently wound: the parts cover all of it, holes and recesses too where
+    no cut opens them. The result is deterministic.
+
+    Raises:
+        InputError: the surface is empty, not finite, or flat.
+    """
+    corners = _triangle_corners(vertices, triangles)
+    low = corners.min(axis=(0, 1))
+    diagonal = float(np.linalg.norm(corners.max(axis=(0, 1)) - low))
+    if not diagonal > 0:
+        raise InputError("the surface is a single point: it has no volume to collide with")
+    corners = (corners - low) / diagonal
+    hull = _hull(corners.reshape(-1, 3))
+    if hull is None:
+        raise InputError("the surface is flat: it has no volume to collide with")
+    pieces = [_Piece(corners, hull)]
+    cuts = [_best_cut(pieces[0], hull.volume, config)]
+    while len(pieces) < config.parts:
+        best = int(np.argmax([gain for gain, _ in cuts]))
+        halves = cuts[best][1]
+        if not halves:
+            break
+        pieces[best : best + 1] = halves
+        cuts[best : best + 1] = [_best_cut(half, hull.volume, config) for half in halves]
+    return [piece.hull.points[piece.hull.vertices] * diagonal + low for piece in pieces]
+
+
+def _triangle_corners(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    vertices, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(triangles)
+    if len(triangles) == 0 or len(vertices) == 0:
+        raise InputError("the surface has no triangles: there is nothing to collide with")
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise InputError(f"triangles refer to vertices {triangles.min()} to {triangles.max()} of {len(vertices)}")
+    corners = vertices[triangles]
+    if not np.isfinite(corners).all():
+        raise InputError("the surface has vertices that are NaN or infinite: repair the mesh first")
+    return corners
+
+
+def _hull(points: np.ndarray) -> Any:
+    """Return the convex hull, or None where the points are flat."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    if len(points) < 4:
+        return None
+    try:
+        hull = ConvexHull(points)
+    except QhullError:
+        return None
+    return hull if hull.volume > 1e-9 else None
+
+
+def _thickness(hull: Any) -> float:
+    """Return the least extent along the normals of the facets."""
+    along = hull.points[hull.vertices] @ np.unique(hull.equations[:, :3].round(6), axis=0).T
+    return float(np.ptp(along, axis=0).min())
+
+
+def _best_cut(piece: _Piece, whole: float, config: HullConfig) -> tuple[float, list[_Piece]]:
+    """Return the volume that the best allowed cut empties, and its two halves (none where no cut is worth it)."""
+    best, gain = None, config.gain * whole
+    if config.parts > 1 and _thickness(piece.hull) >= config.thickness:
+        for axis in range(3):
+            for offset in _offsets(piece.triangles, axis, config):
+                hulls = [_hull(points) for points in _side_points(piece.triangles, axis, offset)]
+                if None in hulls or piece.hull.volume - hulls[0].volume - hulls[1].volume <= gain:
+                    continue
+                if min(_thickness(hull) for hull in hulls) >= config.thickness:
+                    gain = piece.hull.volume - hulls[0].volume - hulls[1].volume
+                    best = (axis, offset, hulls)
+    if best is None:
+        return 0.0, []
+    axis, offset, hulls = best
+    sides = _split(piece.triangles, axis, offset)
+    return gain, [_Piece(side, hull) for side, hull in zip(sides, hulls, strict=True)]
+
+
+def _offsets(triangles: np.ndarray, axis: int, config: HullConfig) -> np.ndarray:
+    """Return where to try cuts: on both sides of the largest flat faces across the axis, and evenly spaced."""
+    along = triangles[:, :, axis]
+    low, high = along.min() + config.thickness / 2, along.max() - config.thickness / 2
+    if low >= high:
+        return np.zeros(0)
+    flat = np.ptp(along, axis=1) < STEP_SHARE
+    normals = np.cross(triangles[flat, 1] - triangles[flat, 0], triangles[flat, 2] - triangles[flat, 0])
+    bins = np.round(along[flat].mean(axis=1) / STEP_SHARE).astype(np.int64)
+    places, inverse = np.unique(bins, return_inverse=True)
+    areas = np.bincount(inverse, weights=np.linalg.norm(normals, axis=1), minlength=len(places))
+    largest = places[np.argsort(-areas, kind="stable")[: config.faces]] * STEP_SHARE
+    spaced = np.linspace(low, high, config.spaced + 2)[1:-1]
+    offsets = np.concatenate([largest - 1.5 * STEP_SHARE, largest + 1.5 * STEP_SHARE, spaced])
+    return offsets[(offsets > low) & (offsets < high)]
+
+
+def _side_points(triangles: np.ndarray, axis: int, offset: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners below and above a plane, each with the points where edges cross it."""
+    start, end = triangles.reshape(-1, 3), np.roll(triangles, -1, axis=1).reshape(-1, 3)
+    below = start[:, axis] < offset
+    crossing = below != (end[:, axis] < offset)
+    share = (offset - start[crossing, axis]) / (end[crossing, axis] - start[crossing, axis])
+    points = start[crossing] + share[:, None] * (end[crossing] - start[crossing])
+    return np.concatenate([start[below], points]), np.concatenate([start[~below], points])
+
+
+def _split(triangles: np.ndarray, axis: int, offset: float) -> list[np.ndarray]:
+    """Return the triangles below and above a plane; those across it are cut in three."""
+    below = triangles[:, :, axis] < offset
+    count = below.sum(axis=1)
+    sides = [[triangles[count == 3]], [triangles[count == 0]]]
+    for lone, side in ((1, 0), (2, 1)):  # the corner that is alone on its side comes first
+        chosen = triangles[count == lone]
+        first = np.argmax(below[count == lone] == (lone == 1), axis=1)
+        a, b, c = (chosen[np.arange(len(chosen)), (first + k) % 3] for k in range(3))
+        ab = a + ((offset - a[:, axis]) / (b[:, axis] - a[:, axis]))[:, None] * (b - a)
+        ac = a + ((offset - a[:, axis]) / (c[:, axis] - a[:, axis]))[:, None] * (c - a)
+        sides[side].append(np.stack([a, ab, ac], axis=1))
+        sides[1 - side] += [np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)]
+    return [np.concatenate(side) for side in sides]
+
+
+def _mass_properties(parts: Sequence[np.ndarray]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return volume, centre and inertia about it at unit density, summed over convex parts."""
+    from scipy.spatial import ConvexHull
+
+    volume, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
+    origin = np.concatenate(parts).mean(axis=0)
+    for part in parts:
+        hull = ConvexHull(part)
+        inside = part.mean(axis=0) - origin
+        corners = part[hull.simplices] - origin
+        # tetrahedra from an inner point to the facets: exact integrals of 1, x and x x^T
+        volumes = np.abs(np.linalg.det(corners - inside)) / 6
+        points = np.concatenate([corners, np.broadcast_to(inside, (len(corners), 1, 3))], axis=1)
+        total = points.sum(axis=1)
+        volume += volumes.sum()
+        first += volumes @ total / 4
+        second += np.einsum("t,ti,tj->ij", volumes, total, total) / 20
+        second += np.einsum("t,tki,tkj->ij", volumes, points, points) / 20
+    center = first / volume
+    second -= volume * np.outer(center, center)
+    return float(volume), center + origin, np.trace(second) * np.eye(3) - second
