@@ -1,0 +1,233 @@
+"""Object models: from a mesh file or a cloud to everything that the rest needs to know of an object."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from kmn_jax.checks import InputError
+from kmn_jax.data.mesh_files import METRES, check_unit, read_mesh
+from kmn_jax.data.surface import outer_surface
+from kmn_jax.data.symmetry import Distance, Symmetries, find_symmetries
+
+_MAX_HULL = 3000  # vertices whose distances are all taken
+
+
+@dataclass(frozen=True)
+class ObjectConfig:
+    """How an object model is made."""
+
+    num_points: int = 2048  # Poisson-disk points on the outer surface; 4,096 to 16,384 for training packs
+    num_keypoints: int = 20
+    symmetry_tolerance: float = 0.02  # share of the diameter
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.num_keypoints <= self.num_points:
+            raise InputError(
+                f"num_keypoints = {self.num_keypoints} must be between 1 and num_points = {self.num_points}"
+            )
+
+
+@dataclass(frozen=True)
+class ObjectModel:
+    """A rigid object, in the frame of its file. All lengths are in `unit`.
+
+    `vertices` and `triangles` are the outer surface, wound outwards; an object given as a cloud has no triangles.
+    `points` are spread evenly over it with outward unit `normals`; keypoints are farthest points among them.
+    """
+
+    name: str
+    unit: str
+    vertices: Float[np.ndarray, "v 3"]
+    triangles: Int[np.ndarray, "t 3"]
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    keypoint_indices: Int[np.ndarray, " k"]
+    minimum: Float[np.ndarray, "3"]  # of the axis-aligned box around it
+    maximum: Float[np.ndarray, "3"]
+    diameter: float  # largest distance between two of its points
+    symmetries: Symmetries
+    digest: str  # SHA-256 of the file, or of the arrays where there was none
+
+    @property
+    def extents(self) -> Float[np.ndarray, "3"]:
+        """The sides of the axis-aligned box around the object."""
+        return self.maximum - self.minimum
+
+    @property
+    def diagonal(self) -> float:
+        """The diagonal of that box: the object's size as published results take it."""
+        return float(np.linalg.norm(self.extents))
+
+    def in_unit(self, unit: str) -> ObjectModel:
+        """Return the same object with its lengths in another unit."""
+        factor = METRES[self.unit] / METRES[check_unit(unit)]
+        return replace(
+            self,
+            unit=unit,
+            vertices=self.vertices * factor,
+            points=(self.points * factor).astype(np.float32),
+            minimum=self.minimum * factor,
+            maximum=self.maximum * factor,
+            diameter=self.diameter * factor,
+            symmetries=replace(self.symmetries, center=self.symmetries.center * factor),
+        )
+
+
+def load_object(path: str | Path, unit: str | None = None, config: ObjectConfig | None = None) -> ObjectModel:
+    """Make an object model of a mesh or cloud file; see `read_mesh` for formats and `unit`.
+
+    The same file, config and library versions give the same bits. Raises InputError if the file is broken or holds
+    no part's surface.
+    """
+    path = Path(path)
+    mesh = read_mesh(path, unit)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    try:
+        if len(mesh.triangles):
+            return object_from_mesh(path.stem, mesh.vertices, mesh.triangles, mesh.unit, config, digest)
+        return object_from_cloud(path.stem, mesh.vertices, mesh.normals, mesh.unit, config, digest)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def object_from_mesh(
+    name: str,
+    vertices: Float[np.ndarray, "v 3"],
+    triangles: Int[np.ndarray, "t 3"],
+    unit: str,
+    config: ObjectConfig | None = None,
+    digest: str | None = None,
+) -> ObjectModel:
+    """Make an object model of a mesh, watertight or not. Raises InputError if it has no surface to see."""
+    import open3d
+
+    config = config or ObjectConfig()
+    surface = outer_surface(vertices, triangles, config.num_points, config.seed)
+    minimum, maximum = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+    middle, scale = (minimum + maximum) / 2, float(np.linalg.norm(maximum - minimum))
+    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(((surface.vertices - middle) / scale).astype(np.float32), surface.triangles.astype(np.uint32))
+
+    def distance(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        return scale * scene.compute_distance(((points - middle) / scale).astype(np.float32)).numpy()
+
+    corners = surface.vertices[surface.triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    center = (area[:, None] * corners.mean(axis=1)).sum(axis=0) / area.sum()
+    offsets = corners - center
+    # The second moments of a triangle: its corners' and their sum's outer products, by the exact formula.
+    sums = offsets.sum(axis=1)
+    moments = np.einsum("t,tci,tcj->ij", area, offsets, offsets) + np.einsum("t,ti,tj->ij", area, sums, sums)
+    return _model(
+        name, unit, config, digest or _digest(vertices, triangles), surface.vertices, surface.triangles,
+        surface.points, surface.normals, center, moments / (12 * area.sum()), distance, config.symmetry_tolerance,
+    )  # fmt: skip
+
+
+def object_from_cloud(
+    name: str,
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"] | None,
+    unit: str,
+    config: ObjectConfig | None = None,
+    digest: str | None = None,
+) -> ObjectModel:
+    """Make an object model of a cloud that covers the whole surface, such as a merged scan.
+
+    Without normals they are estimated and oriented consistently, outwards. Raises InputError for fewer points than the
+    config asks for, since a sparse cloud cannot stand for a surface.
+    """
+    import open3d
+    from scipy.spatial import cKDTree
+
+    config = config or ObjectConfig()
+    if len(points) < config.num_points:
+        raise InputError(
+            f"the cloud has {len(points)} points, but {config.num_points} are needed: scan it more densely"
+        )
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
+    if normals is None or not np.isfinite(normals).all() or not (np.linalg.norm(normals, axis=1) > 0).all():
+        cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(30))
+        cloud.orient_normals_consistent_tangent_plane(30)
+    else:
+        cloud.normals = open3d.utility.Vector3dVector(normals.astype(np.float64))
+        cloud.normalize_normals()
+    if len(points) > 5 * config.num_points:
+        rows = np.random.default_rng(config.seed).choice(len(points), 5 * config.num_points, replace=False)
+        cloud = cloud.select_by_index(np.sort(rows))
+    thinned = cloud.farthest_point_down_sample(config.num_points)
+    kept, directions = np.asarray(thinned.points), np.asarray(thinned.normals)
+    center = kept.mean(axis=0)
+    if normals is None and ((kept - center) * directions).sum() < 0:
+        directions = -directions
+    tree, spacing = cKDTree(points), float(np.median(cKDTree(kept).query(kept, k=2)[0][:, 1]))
+    size = float(np.linalg.norm(np.ptp(kept, axis=0)))
+    if not size > 0 or np.linalg.matrix_rank(kept - center, tol=1e-6 * size) < 2:
+        raise InputError("the cloud's points coincide or lie on a line: that is not a part's surface")
+    return _model(
+        name, unit, config, digest or _digest(points), points.astype(np.float64), np.zeros((0, 3), np.int32),
+        kept.astype(np.float32), directions.astype(np.float32), center, np.cov(kept.T, bias=True),
+        lambda moved: tree.query(moved)[0], config.symmetry_tolerance + spacing / size,
+    )  # fmt: skip
+
+
+def _model(
+    name: str,
+    unit: str,
+    config: ObjectConfig,
+    digest: str,
+    vertices: Float[np.ndarray, "v 3"],
+    triangles: Int[np.ndarray, "t 3"],
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    center: Float[np.ndarray, "3"],
+    moments: Float[np.ndarray, "3 3"],
+    distance: Distance,
+    tolerance: float,
+) -> ObjectModel:
+    from kmn_jax.geometry import farthest_point_indices
+
+    diameter = _diameter(vertices)
+    keypoints = farthest_point_indices(
+        (points - center.astype(np.float32)) / np.float32(diameter), config.num_keypoints
+    )
+    return ObjectModel(
+        name=name,
+        unit=check_unit(unit),
+        vertices=vertices,
+        triangles=triangles,
+        points=points,
+        normals=normals,
+        keypoint_indices=np.asarray(keypoints),
+        minimum=vertices.min(axis=0),
+        maximum=vertices.max(axis=0),
+        diameter=diameter,
+        symmetries=find_symmetries(points.astype(np.float64), center, moments, distance, diameter, min(tolerance, 0.2)),
+        digest=digest,
+    )
+
+
+def _diameter(vertices: Float[np.ndarray, "v 3"]) -> float:
+    """Return the largest distance between vertices, of which only the convex hull's can have it."""
+    from scipy.spatial import ConvexHull, QhullError
+    from scipy.spatial.distance import cdist
+
+    centered = vertices - vertices.mean(axis=0)
+    try:
+        centered = centered[ConvexHull(centered).vertices]
+    except QhullError:  # flat: then the hull joggled out of the plane serves
+        centered = centered[ConvexHull(centered, qhull_options="QJ").vertices]
+    if len(centered) > _MAX_HULL:  # the hull's extremes along that many directions miss 0.1% of the diameter at most
+        directions = np.random.default_rng(0).normal(size=(_MAX_HULL, 3))
+        centered = centered[np.unique((directions @ centered.T).argmax(axis=1))]
+    return float(cdist(centered, centered).max())
+
+
+def _digest(*arrays: np.ndarray) -> str:
+    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
