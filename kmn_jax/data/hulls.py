@@ -51,8 +51,18 @@ class CollisionShape:
 
 
 class _Piece(NamedTuple):
-    triangles: np.ndarray  # (t, 3, 3) corners
-    hull: Any  # scipy.spatial.ConvexHull
+    triangles: Float[np.ndarray, "t 3 3"]  # corners
+    outline: Any  # scipy.spatial.ConvexHull of outermost points
+
+
+def _fibonacci_sphere(count: int) -> Float[np.ndarray, "{count} 3"]:
+    index = np.arange(count) + 0.5
+    z, angle = 1 - 2 * index / count, index * np.pi * (1 + 5**0.5)
+    radius = np.sqrt(1 - z**2)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+
+
+DIRECTIONS = _fibonacci_sphere(256)  # cuts are compared on the outermost points in these; hulls have all corners
 
 
 def collision_shape(
@@ -88,20 +98,17 @@ def collision_hulls(
     diagonal = float(np.linalg.norm(corners.max(axis=(0, 1)) - low))
     if not diagonal > 0:
         raise InputError("the surface is a single point: it has no volume to collide with")
-    corners = (corners - low) / diagonal
-    hull = _hull(corners.reshape(-1, 3))
-    if hull is None:
-        raise InputError("the surface is flat: it has no volume to collide with")
-    pieces = [_Piece(corners, hull)]
-    cuts = [_best_cut(pieces[0], hull.volume, config)]
+    pieces = [_piece((corners - low) / diagonal)]
+    whole = pieces[0].outline.volume
+    cuts = [_best_cut(pieces[0], whole, config)]
     while len(pieces) < config.parts:
         best = int(np.argmax([gain for gain, _ in cuts]))
         halves = cuts[best][1]
         if not halves:
             break
         pieces[best : best + 1] = halves
-        cuts[best : best + 1] = [_best_cut(half, hull.volume, config) for half in halves]
-    return [piece.hull.points[piece.hull.vertices] * diagonal + low for piece in pieces]
+        cuts[best : best + 1] = [_best_cut(half, whole, config) for half in halves]
+    return [_hull_corners(piece.triangles) * diagonal + low for piece in pieces]
 
 
 def _triangle_corners(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -116,14 +123,39 @@ def _triangle_corners(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray
     return corners
 
 
-def _hull(points: np.ndarray) -> Any:
-    """Return the convex hull, or None where the points are flat."""
+def _piece(triangles: np.ndarray) -> _Piece:
+    outline = _outline(_distinct(triangles.reshape(-1, 3)))
+    if outline is None:
+        raise InputError("the surface is flat: it has no volume to collide with")
+    return _Piece(triangles, outline)
+
+
+def _distinct(points: np.ndarray) -> np.ndarray:
+    """Return points without their copies (told apart by one projection, which is fast)."""
+    return points[np.unique(points @ [1.0, 2**0.5, 3**0.5], return_index=True)[1]]
+
+
+def _hull_corners(triangles: np.ndarray) -> np.ndarray:
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(_distinct(triangles.reshape(-1, 3)))
+    return hull.points[hull.vertices]
+
+
+def _outermost(points: np.ndarray) -> np.ndarray:
+    if len(points) <= len(DIRECTIONS):
+        return points
+    return points[np.unique(np.argmax(DIRECTIONS @ points.T, axis=1))]
+
+
+def _outline(points: np.ndarray) -> Any:
+    """Return the convex hull of the outermost points, or None where they are flat."""
     from scipy.spatial import ConvexHull, QhullError
 
     if len(points) < 4:
         return None
     try:
-        hull = ConvexHull(points)
+        hull = ConvexHull(_outermost(points))
     except QhullError:
         return None
     return hull if hull.volume > 1e-9 else None
@@ -131,27 +163,29 @@ def _hull(points: np.ndarray) -> Any:
 
 def _thickness(hull: Any) -> float:
     """Return the least extent along the normals of the facets."""
-    along = hull.points[hull.vertices] @ np.unique(hull.equations[:, :3].round(6), axis=0).T
+    along = hull.points[hull.vertices] @ hull.equations[:, :3].T
     return float(np.ptp(along, axis=0).min())
 
 
 def _best_cut(piece: _Piece, whole: float, config: HullConfig) -> tuple[float, list[_Piece]]:
     """Return the volume that the best allowed cut empties, and its two halves (none where no cut is worth it)."""
     best, gain = None, config.gain * whole
-    if config.parts > 1 and _thickness(piece.hull) >= config.thickness:
+    if config.parts > 1 and _thickness(piece.outline) >= config.thickness:
+        points = _distinct(piece.triangles.reshape(-1, 3))
         for axis in range(3):
-            for offset in _offsets(piece.triangles, axis, config):
-                hulls = [_hull(points) for points in _side_points(piece.triangles, axis, offset)]
-                if None in hulls or piece.hull.volume - hulls[0].volume - hulls[1].volume <= gain:
+            offsets = _offsets(piece.triangles, axis, config)
+            slabs = np.searchsorted(offsets, points[:, axis], side="right")
+            outermost = [_outermost(points[slabs == slab]) for slab in range(len(offsets) + 1)]
+            for number, offset in enumerate(offsets):
+                border = _crossings(piece.triangles, axis, offset)
+                sides = outermost[: number + 1], outermost[number + 1 :]
+                outlines = [_outline(np.concatenate([*side, border])) for side in sides]
+                if None in outlines or piece.outline.volume - sum(outline.volume for outline in outlines) <= gain:
                     continue
-                if min(_thickness(hull) for hull in hulls) >= config.thickness:
-                    gain = piece.hull.volume - hulls[0].volume - hulls[1].volume
-                    best = (axis, offset, hulls)
-    if best is None:
-        return 0.0, []
-    axis, offset, hulls = best
-    sides = _split(piece.triangles, axis, offset)
-    return gain, [_Piece(side, hull) for side, hull in zip(sides, hulls, strict=True)]
+                if min(_thickness(outline) for outline in outlines) >= config.thickness:
+                    gain = piece.outline.volume - sum(outline.volume for outline in outlines)
+                    best = (axis, offset)
+    return (0.0, []) if best is None else (gain, [_piece(side) for side in _split(piece.triangles, *best)])
 
 
 def _offsets(triangles: np.ndarray, axis: int, config: HullConfig) -> np.ndarray:
@@ -168,17 +202,18 @@ def _offsets(triangles: np.ndarray, axis: int, config: HullConfig) -> np.ndarray
     largest = places[np.argsort(-areas, kind="stable")[: config.faces]] * STEP_SHARE
     spaced = np.linspace(low, high, config.spaced + 2)[1:-1]
     offsets = np.concatenate([largest - 1.5 * STEP_SHARE, largest + 1.5 * STEP_SHARE, spaced])
-    return offsets[(offsets > low) & (offsets < high)]
+    return np.unique(offsets[(offsets > low) & (offsets < high)])
 
 
-def _side_points(triangles: np.ndarray, axis: int, offset: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners below and above a plane, each with the points where edges cross it."""
-    start, end = triangles.reshape(-1, 3), np.roll(triangles, -1, axis=1).reshape(-1, 3)
-    below = start[:, axis] < offset
-    crossing = below != (end[:, axis] < offset)
-    share = (offset - start[crossing, axis]) / (end[crossing, axis] - start[crossing, axis])
-    points = start[crossing] + share[:, None] * (end[crossing] - start[crossing])
-    return np.concatenate([start[below], points]), np.concatenate([start[~below], points])
+def _crossings(triangles: np.ndarray, axis: int, offset: float) -> np.ndarray:
+    """Return the points where edges cross a plane."""
+    low, high = triangles[:, :, axis].min(axis=1), triangles[:, :, axis].max(axis=1)
+    crossed = triangles[(low < offset) & (high >= offset)]
+    start, end = crossed.reshape(-1, 3), np.roll(crossed, -1, axis=1).reshape(-1, 3)
+    across = (start[:, axis] < offset) != (end[:, axis] < offset)
+    start, end = start[across], end[across]
+    share = (offset - start[:, axis]) / (end[:, axis] - start[:, axis])
+    return start + share[:, None] * (end - start)
 
 
 def _split(triangles: np.ndarray, axis: int, offset: float) -> list[np.ndarray]:

@@ -23,36 +23,41 @@ WALLS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # outward directions of the bin's fo
 class BinConfig:
     """How copies are dropped, simulated and accepted. Lengths are in diagonals of the object, times in seconds.
 
-    The bin is `length` x `width` x `height` times one factor, drawn for each attempt from `scale`; factors whose bin
-    would overflow, at `packing` (hulls' volume to filled volume), are left out.
+    Each attempt draws its bin: `length` x `width` times one factor from the range `scale`, of a height from the range
+    `height`. Factors whose bin would overflow, where copies fill the share `packing` of the space, are left out. Small
+    factors pile copies higher: of 20, about 80% touch the floor at 1.0, and 40% at 0.65.
     """
 
     length: float = 3.4
     width: float = 2.4
-    height: float = 1.2
+    scale: tuple[float, float] = (0.6, 1.05)
+    height: tuple[float, float] = (1.0, 1.4)
     thickness: float = 0.05
-    scale: tuple[float, float] = (0.7, 1.1)
-    packing: float = 0.4
+    packing: float = 0.35
 
     step: float = 0.002
     friction: float = 0.5
-    damping: tuple[float, float] = (1.0, 0.5)  # of the speed and of the rotation, per second
+    damping: tuple[float, float] = (1.0, 0.5)  # of speed and of rotation, per second
     check_every: float = 0.1
     rest_checks: int = 2
     rest_speed: float = 0.15  # diagonals per second
     rest_rotation: float = 0.3  # radians per second
     time_cap: float = 4.0
 
-    penetration: float = 0.003
-    overlap: float = 0.003  # of hulls and the bin's walls and floor
+    penetration: float = 0.003  # the most that an accepted scene shows in a contact, and in walls and floor
     attempts: int = 8
 
     def __post_init__(self) -> None:
-        for name in ("length", "width", "height", "thickness", "step", "check_every", "time_cap", "penetration"):
+        positive = ("length", "width", "thickness", "step", "check_every", "rest_speed", "rest_rotation", "time_cap")
+        for name in (*positive, "penetration"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"bin config: {name} is {getattr(self, name)}, but must be above zero and finite")
-        if not 0 < self.scale[0] <= self.scale[1] < math.inf:
-            raise InputError(f"bin config: scale is {self.scale}, but must be a range above zero")
+        for name in ("scale", "height"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high < math.inf:
+                raise InputError(f"bin config: {name} is {(low, high)}, but must be a range above zero")
+        if not 0 <= min(self.friction, *self.damping) <= max(self.friction, *self.damping) < math.inf:
+            raise InputError("bin config: friction and damping must be 0 or more, and finite")
         if not 0 < self.packing <= 1:
             raise InputError(f"bin config: packing is {self.packing}, but must be above 0 and at most 1")
         if self.attempts < 1 or self.rest_checks < 1:
@@ -65,8 +70,9 @@ class BinConfig:
 class DropResult:
     """What became of a drop. Poses and bin are in the object's unit, and of the last attempt where none was accepted.
 
-    `penetration`: the deepest contact; `speed`: of the fastest copy, a second; both in diagonals. `capped`: not at rest
-    when the time was over. `floor_share`: copies that touch the floor. `rejected`: why each attempt was not used.
+    `penetration` is the deepest contact and `speed` that of the fastest copy, in diagonals (a second); `rotation` is in
+    radians per second. `capped` means not at rest when the time was over. `floor_share` of the copies touch the floor.
+    `rejected` says why each attempt was not used. There are no poses where not even dropping was possible.
     """
 
     accepted: bool
@@ -87,53 +93,70 @@ class _Rest:
     """The end of one simulation, in simulated metres."""
 
     T_bin_body: np.ndarray
-    penetration: float
-    speed: float
-    rotation: float
-    time: float
-    floor_share: float
-    above_rim: bool
+    penetration: float = 0.0
+    speed: float = 0.0
+    rotation: float = 0.0
+    time: float = 0.0
+    capped: bool = False
+    floor_share: float = 0.0
+    above_rim: bool = False
+    warnings: str = ""
 
 
 def settle(shape: CollisionShape, copies: int, config: BinConfig, seed: int | Sequence[int]) -> DropResult:
     """Drop copies of an object into a bin and let them come to rest.
 
-    The same arguments give the same bits on one machine. That nothing was accepted is told by the result, never by an
-    exception.
+    The same arguments give the same bits on one machine. That nothing could be accepted is told by the result, never by
+    an exception.
 
     Args:
         shape: collision shape of the object, see `collision_shape`.
         copies: how many, 1 or more.
-        seed: a number, or several (of the run, of the object, of the drop).
+        seed: one number or several, 0 or more, such as those of the run, of the object and of the drop.
 
     Raises:
-        InputError: there are no copies, or the shape is not finite.
+        InputError: there are no copies, a seed is negative, or the shape has no volume.
     """
     if copies < 1:
         raise InputError(f"copies is {copies}, but a bin needs 1 or more")
-    if not (math.isfinite(shape.diagonal) and shape.diagonal > 0 and math.isfinite(shape.volume) and shape.volume > 0):
+    if np.min(seed, initial=0) < 0:
+        raise InputError(f"seed is {seed}, but must be 0 or more")
+    if not (0 < shape.diagonal < math.inf and 0 < shape.volume < math.inf):
         raise InputError(
             f"the collision shape has diagonal {shape.diagonal} and volume {shape.volume}: both must be > 0"
         )
     rng = np.random.default_rng(seed)
-    scales = _bin_scales(shape, copies, config)
     body = _Body(shape)
+    least, most = _bin_scales(shape, copies, config)
     rejected: list[str] = []
-    for attempt in range(1, config.attempts + 1):
-        factor = SIMULATED_DIAGONAL * rng.uniform(*scales)
-        size = np.array([config.length, config.width, config.height]) * factor
+    accepted = False
+    while not accepted and len(rejected) < config.attempts:
+        scale = rng.uniform(least, most)
+        size = np.array([config.length * scale, config.width * scale, rng.uniform(*config.height)]) * SIMULATED_DIAGONAL
         spawned = _spawn(body, copies, size, rng)
         if spawned is None:
-            rejected.append("the bin is too small to drop the object into it")
-            continue
-        rest = _simulate(body, spawned, size, config)
-        reasons = _faults(body, rest, size, config)
-        if not reasons:
-            return _result(True, body, rest, size, attempt, rejected, config)
-        rejected.append(reasons)
-    if spawned is None:
-        rest = _Rest(np.zeros((0, 4, 4)), 0.0, 0.0, 0.0, 0.0, 0.0, False)
-    return _result(False, body, rest, size, config.attempts, rejected, config)
+            rest, faults = _Rest(np.zeros((0, 4, 4))), "the bin is too small to drop the object into it"
+        else:
+            rest = _simulate(body, spawned, size, config)
+            faults = _faults(body, rest, size, config)
+        accepted = not faults
+        if faults:
+            rejected.append(faults)
+            least = min(max(least, 1.1 * scale), most)  # most faults are those of a bin that is too full
+    length, width, height = (float(value) for value in size / body.scale)
+    return DropResult(
+        accepted=accepted,
+        T_bin_object=body.to_object(rest.T_bin_body),
+        bin=Bin(length, width, height, config.thickness * shape.diagonal),
+        penetration=rest.penetration / SIMULATED_DIAGONAL,
+        speed=rest.speed / SIMULATED_DIAGONAL,
+        rotation=rest.rotation,
+        simulated_time=rest.time,
+        capped=rest.capped,
+        floor_share=rest.floor_share,
+        attempts=len(rejected) + accepted,
+        rejected=tuple(rejected),
+    )
 
 
 class _Body:
@@ -157,9 +180,9 @@ class _Body:
 
 
 def _bin_scales(shape: CollisionShape, copies: int, config: BinConfig) -> tuple[float, float]:
-    """Return the range of scales whose bins hold the copies; the largest bin where none does."""
-    room = config.length * config.width * config.height * shape.diagonal**3 * config.packing
-    least = (copies * shape.volume / room) ** (1 / 3)
+    """Return the range of scales whose bins hold the copies; the largest scale where none does."""
+    room = config.packing * config.length * config.width * config.height[0] * shape.diagonal**3
+    least = math.sqrt(copies * shape.volume / room)
     return min(max(config.scale[0], least), config.scale[1]), config.scale[1]
 
 
@@ -168,11 +191,10 @@ def _spawn(body: _Body, copies: int, size: np.ndarray, rng: np.random.Generator)
     from scipy.spatial.transform import Rotation
 
     gap = 0.02 * SIMULATED_DIAGONAL
-    boxes: list[tuple[np.ndarray, np.ndarray]] = []
+    lows, highs = np.zeros((0, 3)), np.zeros((0, 3))
     poses = np.tile(np.eye(4), (copies, 1, 1))
     for pose in poses:
-        for _ in range(20):
-            rotation = Rotation.random(rng=rng).as_matrix()
+        for rotation in Rotation.random(20, rng=rng).as_matrix():
             corners = body.corners @ rotation.T
             low, high = corners.min(axis=0) - gap, corners.max(axis=0) + gap
             room = size[:2] - (high - low)[:2]
@@ -180,19 +202,15 @@ def _spawn(body: _Body, copies: int, size: np.ndarray, rng: np.random.Generator)
                 break
         else:
             return None
-        best = None
-        for _ in range(4):
-            at = np.append(rng.uniform(size=2) * room - size[:2] / 2 - low[:2], -low[2])
-            below = [
-                top[2]
-                for bottom, top in boxes
-                if (bottom[:2] < (high + at)[:2]).all() and (top[:2] > (low + at)[:2]).all()
-            ]
-            at[2] += max(below, default=0.0)
-            if best is None or at[2] < best[2]:
-                best = at
-        pose[:3, :3], pose[:3, 3] = rotation, best
-        boxes.append((low + best, high + best))
+        places = []
+        for x, y in rng.uniform(size=(4, 2)) * room - size[:2] / 2 - low[:2]:
+            place = np.array([x, y, -low[2]])
+            under = ((lows < high + place) & (highs > low + place))[:, :2].all(axis=1)
+            place[2] += highs[under, 2].max(initial=0.0)
+            places.append(place)
+        place = min(places, key=lambda xyz: xyz[2])
+        pose[:3, :3], pose[:3, 3] = rotation, place
+        lows, highs = np.vstack([lows, low + place]), np.vstack([highs, high + place])
     return poses
 
 
@@ -236,77 +254,63 @@ def _model(body: _Body, copies: int, size: np.ndarray, config: BinConfig) -> Any
 
 
 def _simulate(body: _Body, T_bin_body: np.ndarray, size: np.ndarray, config: BinConfig) -> _Rest:
+    """Let the bodies fall until they rest, or the time is over, or mujoco warns."""
     import mujoco
     from scipy.spatial.transform import Rotation
 
     copies = len(T_bin_body)
-    model = _model(body, copies, size, config)
+    try:
+        model = _model(body, copies, size, config)
+    except ValueError as error:
+        return _Rest(T_bin_body, warnings=f"mujoco refuses the shape: {error}")
     data = mujoco.MjData(model)
     quaternions = Rotation.from_matrix(T_bin_body[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
     data.qpos[:] = np.concatenate([T_bin_body[:, :3, 3], quaternions], axis=1).ravel()
     steps = round(config.check_every / config.step)
-    calm, finite = 0, True
-    speed = rotation = math.inf
-    while calm < config.rest_checks and data.time < config.time_cap - config.step / 2 and finite:
+    checks, calm = max(1, round(config.time_cap / config.check_every)), 0
+    for _ in range(checks):
         mujoco.mj_step(model, data, nstep=steps)
-        velocity = data.qvel.reshape(copies, 2, 3)
-        finite = bool(np.isfinite(data.qpos).all() and np.isfinite(velocity).all()) and not data.warning.number.any()
-        speed, rotation = np.linalg.norm(velocity, axis=2).max(axis=0)
+        if data.warning.number.any():
+            break
+        speed, rotation = np.linalg.norm(data.qvel.reshape(copies, 2, 3), axis=2).max(axis=0)
         still = speed < config.rest_speed * SIMULATED_DIAGONAL and rotation < config.rest_rotation
         calm = calm + 1 if still else 0
-    mujoco.mj_forward(model, data)
+        if calm == config.rest_checks:
+            break
+    warned = np.flatnonzero(data.warning.number)
+    if warned.size:
+        names = ", ".join(mujoco.mjtWarning(int(kind)).name for kind in warned)
+        return _Rest(T_bin_body, time=float(data.time), warnings=f"the simulation broke down: {names}")
+    mujoco.mj_forward(model, data)  # contacts of the last pose
     poses = np.tile(np.eye(4), (copies, 1, 1))
-    if finite:
-        poses[:, :3, 3] = data.xpos[1:]
-        poses[:, :3, :3] = data.xmat[1:].reshape(copies, 3, 3)
-    geoms, distances = data.contact.geom, data.contact.dist
-    on_floor = np.unique(model.geom_bodyid[geoms[(geoms == 0).any(axis=1)]])
+    poses[:, :3, 3] = data.xpos[1:]
+    poses[:, :3, :3] = data.xmat[1:].reshape(copies, 3, 3)
+    geoms = data.contact.geom
+    on_floor = model.geom_bodyid[geoms[(geoms == 0).any(axis=1)]]
     on_wall = ((geoms > 0) & (geoms <= len(WALLS))).any(axis=1)
     return _Rest(
         T_bin_body=poses,
-        penetration=float(max(0.0, -distances.min(initial=0.0))) if finite else math.inf,
+        penetration=max(0.0, -float(data.contact.dist.min(initial=0.0))),
         speed=float(speed),
         rotation=float(rotation),
         time=float(data.time),
-        floor_share=(len(on_floor) - (0 in on_floor)) / copies,
+        capped=calm < config.rest_checks,
+        floor_share=len(np.unique(on_floor[on_floor > 0])) / copies,
         above_rim=bool((data.contact.pos[on_wall, 2] > size[2]).any()),
     )
 
 
-def _at_rest(rest: _Rest, config: BinConfig) -> bool:
-    return rest.speed < config.rest_speed * SIMULATED_DIAGONAL and rest.rotation < config.rest_rotation
-
-
 def _faults(body: _Body, rest: _Rest, size: np.ndarray, config: BinConfig) -> str:
     """Return why a scene cannot be used; empty if it can."""
+    if rest.warnings:
+        return rest.warnings
     faults = []
-    if not math.isfinite(rest.penetration):
-        return "the simulation diverged"
     if rest.penetration > config.penetration * SIMULATED_DIAGONAL:
         faults.append(f"copies penetrate by {rest.penetration / SIMULATED_DIAGONAL:.2%} of the diagonal")
     corners = np.einsum("nij,vj->nvi", rest.T_bin_body[:, :3, :3], body.corners) + rest.T_bin_body[:, None, :3, 3]
-    beyond = max((np.abs(corners[..., :2]) - size[:2] / 2).max(), -corners[..., 2].min())
-    if beyond > config.overlap * SIMULATED_DIAGONAL:
-        faults.append(f"a copy is {beyond / SIMULATED_DIAGONAL:.2%} of the diagonal inside of a wall or the floor")
+    beyond = float(max((np.abs(corners[..., :2]) - size[:2] / 2).max(), -corners[..., 2].min()))
+    if beyond > config.penetration * SIMULATED_DIAGONAL:
+        faults.append(f"a copy reaches {beyond / SIMULATED_DIAGONAL:.2%} of the diagonal into a wall or the floor")
     if rest.above_rim:
         faults.append("a copy leans on the wall above the rim")
     return ", ".join(faults)
-
-
-def _result(
-    accepted: bool, body: _Body, rest: _Rest, size: np.ndarray, attempts: int, rejected: list[str], config: BinConfig
-) -> DropResult:
-    length, width, height = (float(value) for value in size / body.scale)
-    return DropResult(
-        accepted=accepted,
-        T_bin_object=body.to_object(rest.T_bin_body),
-        bin=Bin(length, width, height, config.thickness * body.shape.diagonal),
-        penetration=rest.penetration / SIMULATED_DIAGONAL,
-        speed=rest.speed / SIMULATED_DIAGONAL,
-        rotation=rest.rotation,
-        simulated_time=rest.time,
-        capped=not _at_rest(rest, config),
-        floor_share=rest.floor_share,
-        attempts=attempts,
-        rejected=tuple(rejected),
-    )
