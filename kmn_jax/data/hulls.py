@@ -11,6 +11,8 @@ from jaxtyping import Float, Int
 
 from kmn_jax.checks import InputError
 
+FLAT_SHARE = 1e-3  # a surface thinner than this share of the diagonal counts as flat
+QHULL_OPTIONS = "Qt Pp"  # triangulated, and no remarks on the terminal
 STEP_SHARE = 1e-3  # a cut runs this share of the diagonal beside a flat face, so that the face falls to one side
 
 
@@ -96,9 +98,12 @@ def collision_hulls(
     corners = _triangle_corners(vertices, triangles)
     low = corners.min(axis=(0, 1))
     diagonal = float(np.linalg.norm(corners.max(axis=(0, 1)) - low))
-    if not diagonal > 0:
-        raise InputError("the surface is a single point: it has no volume to collide with")
-    pieces = [_piece((corners - low) / diagonal)]
+    unit = (corners - low) / (diagonal or 1.0)
+    centered = unit.reshape(-1, 3) - unit.mean(axis=(0, 1))
+    least = float(np.ptp(centered @ np.linalg.eigh(centered.T @ centered)[1], axis=0).min())
+    if least < FLAT_SHARE:
+        raise InputError(f"the surface is flat: its thickness is {least:.1e} of its diagonal, but must be {FLAT_SHARE}")
+    pieces = [_piece(unit)]
     whole = pieces[0].outline.volume
     cuts = [_best_cut(pieces[0], whole, config)]
     while len(pieces) < config.parts:
@@ -124,10 +129,7 @@ def _triangle_corners(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray
 
 
 def _piece(triangles: np.ndarray) -> _Piece:
-    outline = _outline(_distinct(triangles.reshape(-1, 3)))
-    if outline is None:
-        raise InputError("the surface is flat: it has no volume to collide with")
-    return _Piece(triangles, outline)
+    return _Piece(triangles, _outline(_distinct(triangles.reshape(-1, 3))))
 
 
 def _distinct(points: np.ndarray) -> np.ndarray:
@@ -138,7 +140,7 @@ def _distinct(points: np.ndarray) -> np.ndarray:
 def _hull_corners(triangles: np.ndarray) -> np.ndarray:
     from scipy.spatial import ConvexHull
 
-    hull = ConvexHull(_distinct(triangles.reshape(-1, 3)))
+    hull = ConvexHull(_distinct(triangles.reshape(-1, 3)), qhull_options=QHULL_OPTIONS)
     return hull.points[hull.vertices]
 
 
@@ -155,10 +157,9 @@ def _outline(points: np.ndarray) -> Any:
     if len(points) < 4:
         return None
     try:
-        hull = ConvexHull(_outermost(points))
+        return ConvexHull(_outermost(points), qhull_options=QHULL_OPTIONS)
     except QhullError:
         return None
-    return hull if hull.volume > 1e-9 else None
 
 
 def _thickness(hull: Any) -> float:
@@ -239,7 +240,7 @@ def _mass_properties(parts: Sequence[np.ndarray]) -> tuple[float, np.ndarray, np
     volume, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
     origin = np.concatenate(parts).mean(axis=0)
     for part in parts:
-        hull = ConvexHull(part)
+        hull = ConvexHull(part, qhull_options=QHULL_OPTIONS)
         inside = part.mean(axis=0) - origin
         corners = part[hull.simplices] - origin
         # tetrahedra from an inner point to the facets: exact integrals of 1, x and x x^T

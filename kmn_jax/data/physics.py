@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,16 +49,16 @@ class BinConfig:
     attempts: int = 8
 
     def __post_init__(self) -> None:
-        positive = ("length", "width", "thickness", "step", "check_every", "rest_speed", "rest_rotation", "time_cap")
-        for name in (*positive, "penetration"):
+        sizes, times = ("length", "width", "thickness"), ("step", "check_every", "time_cap")
+        for name in (*sizes, *times, "friction", "rest_speed", "rest_rotation", "penetration"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"bin config: {name} is {getattr(self, name)}, but must be above zero and finite")
         for name in ("scale", "height"):
             low, high = getattr(self, name)
             if not 0 < low <= high < math.inf:
                 raise InputError(f"bin config: {name} is {(low, high)}, but must be a range above zero")
-        if not 0 <= min(self.friction, *self.damping) <= max(self.friction, *self.damping) < math.inf:
-            raise InputError("bin config: friction and damping must be 0 or more, and finite")
+        if not 0 <= min(self.damping) <= max(self.damping) < math.inf:
+            raise InputError(f"bin config: damping is {self.damping}, but must be 0 or more, and finite")
         if not 0 < self.packing <= 1:
             raise InputError(f"bin config: packing is {self.packing}, but must be above 0 and at most 1")
         if self.attempts < 1 or self.rest_checks < 1:
@@ -100,6 +101,7 @@ class _Rest:
     capped: bool = False
     floor_share: float = 0.0
     above_rim: bool = False
+    in_air: bool = False
     warnings: str = ""
 
 
@@ -134,8 +136,8 @@ def settle(shape: CollisionShape, copies: int, config: BinConfig, seed: int | Se
         scale = rng.uniform(least, most)
         size = np.array([config.length * scale, config.width * scale, rng.uniform(*config.height)]) * SIMULATED_DIAGONAL
         spawned = _spawn(body, copies, size, rng)
-        if spawned is None:
-            rest, faults = _Rest(np.zeros((0, 4, 4))), "the bin is too small to drop the object into it"
+        if spawned is None or copies * body.volume > size.prod():
+            rest, faults = _Rest(np.zeros((0, 4, 4))), "the bin is too small for the copies"
         else:
             rest = _simulate(body, spawned, size, config)
             faults = _faults(body, rest, size, config)
@@ -167,7 +169,8 @@ class _Body:
         self.scale = SIMULATED_DIAGONAL / shape.diagonal
         self.parts = [(part - shape.center) @ shape.R_object_principal * self.scale for part in shape.parts]
         self.corners = np.concatenate(self.parts)
-        self.mass = 1000.0 * shape.volume * self.scale**3
+        self.volume = shape.volume * self.scale**3
+        self.mass = 1000.0 * self.volume
         self.inertia = shape.inertia * self.scale**2 * self.mass
 
     def to_object(self, T_bin_body: np.ndarray) -> np.ndarray:
@@ -269,7 +272,8 @@ def _simulate(body: _Body, T_bin_body: np.ndarray, size: np.ndarray, config: Bin
     steps = round(config.check_every / config.step)
     checks, calm = max(1, round(config.time_cap / config.check_every)), 0
     for _ in range(checks):
-        mujoco.mj_step(model, data, nstep=steps)
+        with _warnings_unprinted():
+            mujoco.mj_step(model, data, nstep=steps)
         if data.warning.number.any():
             break
         speed, rotation = np.linalg.norm(data.qvel.reshape(copies, 2, 3), axis=2).max(axis=0)
@@ -286,7 +290,8 @@ def _simulate(body: _Body, T_bin_body: np.ndarray, size: np.ndarray, config: Bin
     poses[:, :3, 3] = data.xpos[1:]
     poses[:, :3, :3] = data.xmat[1:].reshape(copies, 3, 3)
     geoms = data.contact.geom
-    on_floor = model.geom_bodyid[geoms[(geoms == 0).any(axis=1)]]
+    touching = model.geom_bodyid[geoms]
+    on_floor = touching[(geoms == 0).any(axis=1)]
     on_wall = ((geoms > 0) & (geoms <= len(WALLS))).any(axis=1)
     return _Rest(
         T_bin_body=poses,
@@ -297,7 +302,21 @@ def _simulate(body: _Body, T_bin_body: np.ndarray, size: np.ndarray, config: Bin
         capped=calm < config.rest_checks,
         floor_share=len(np.unique(on_floor[on_floor > 0])) / copies,
         above_rim=bool((data.contact.pos[on_wall, 2] > size[2]).any()),
+        in_air=len(np.unique(touching[touching > 0])) < copies,
     )
+
+
+@contextmanager
+def _warnings_unprinted() -> Iterator[None]:
+    """Keep mujoco from writing a log file into the working directory; its warnings are counted in the data."""
+    import mujoco
+
+    previous = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(previous)
 
 
 def _faults(body: _Body, rest: _Rest, size: np.ndarray, config: BinConfig) -> str:
@@ -313,4 +332,6 @@ def _faults(body: _Body, rest: _Rest, size: np.ndarray, config: BinConfig) -> st
         faults.append(f"a copy reaches {beyond / SIMULATED_DIAGONAL:.2%} of the diagonal into a wall or the floor")
     if rest.above_rim:
         faults.append("a copy leans on the wall above the rim")
+    if rest.in_air:
+        faults.append("a copy touches nothing")
     return ", ".join(faults)
