@@ -1,10 +1,13 @@
-"""Writing files that appear complete or not at all."""
+"""Writing files that appear complete or not at all; reading safetensors files."""
 
 from __future__ import annotations
 
 import os
 import tempfile
 from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
 
 from kmn_jax.checks import InputError
 
@@ -30,3 +33,13 @@ def write_whole(path: str | Path, content: bytes) -> None:
     finally:
         if os.path.exists(temporary):
             os.unlink(temporary)
+
+
+def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Return tensors and header of a .safetensors file, or raise InputError."""
+    try:
+        with safe_open(str(path), "np") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a mapping)
+            return tensors, file.metadata() or {}
+    except (SafetensorError, OSError, AttributeError, TypeError) as error:  # the latter two: dtypes NumPy lacks
+        raise InputError(f"{path} is not a readable safetensors file: {error}") from None

@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.mesh_files import METRES, check_unit, read_mesh
-from kmn_jax.data.surface import outer_surface
+from kmn_jax.data.surface import OuterSurface, outer_surface
 from kmn_jax.data.symmetry import Distance, Symmetries, find_symmetries
 
 _MAX_HULL = 3000  # vertices whose distances are all taken
@@ -22,15 +23,12 @@ class ObjectConfig:
     """How an object model is made."""
 
     num_points: int = 2048  # Poisson-disk points on the outer surface; 4,096 to 16,384 for training packs
-    num_keypoints: int = 20
     symmetry_tolerance: float = 0.02  # share of the diameter
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not 1 <= self.num_keypoints <= self.num_points:
-            raise InputError(
-                f"num_keypoints = {self.num_keypoints} must be between 1 and num_points = {self.num_points}"
-            )
+        if self.num_points < 64:
+            raise InputError(f"num_points = {self.num_points} cannot stand for a surface: take 64 or more")
 
 
 @dataclass(frozen=True)
@@ -38,7 +36,8 @@ class ObjectModel:
     """A rigid object, in the frame of its file. All lengths are in `unit`.
 
     `vertices` and `triangles` are the outer surface, wound outwards; an object given as a cloud has no triangles.
-    `points` are spread evenly over it with outward unit `normals`; keypoints are farthest points among them.
+    `points` are spread evenly over it, with outward unit `normals`, in farthest-point order: any first part of them
+    covers the object evenly, and the first K are its keypoints.
     """
 
     name: str
@@ -47,10 +46,11 @@ class ObjectModel:
     triangles: Int[np.ndarray, "t 3"]
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
-    keypoint_indices: Int[np.ndarray, " k"]
     minimum: Float[np.ndarray, "3"]  # of the axis-aligned box around it
     maximum: Float[np.ndarray, "3"]
     diameter: float  # largest distance between two of its points
+    area: float  # of the outer surface
+    hidden_share: float  # of the file's area that lies inside and was left out
     symmetries: Symmetries
     digest: str  # SHA-256 of the file, or of the arrays where there was none
 
@@ -75,6 +75,7 @@ class ObjectModel:
             minimum=self.minimum * factor,
             maximum=self.maximum * factor,
             diameter=self.diameter * factor,
+            area=self.area * factor**2,
             symmetries=replace(self.symmetries, center=self.symmetries.center * factor),
         )
 
@@ -108,26 +109,24 @@ def object_from_mesh(
     import open3d
 
     config = config or ObjectConfig()
-    surface = outer_surface(vertices, triangles, config.num_points, config.seed)
-    minimum, maximum = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+    outer = outer_surface(vertices, triangles, config.num_points, config.seed)
+    minimum, maximum = outer.vertices.min(axis=0), outer.vertices.max(axis=0)
     middle, scale = (minimum + maximum) / 2, float(np.linalg.norm(maximum - minimum))
     scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(((surface.vertices - middle) / scale).astype(np.float32), surface.triangles.astype(np.uint32))
+    scene.add_triangles(((outer.vertices - middle) / scale).astype(np.float32), outer.triangles.astype(np.uint32))
 
     def distance(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         return scale * scene.compute_distance(((points - middle) / scale).astype(np.float32)).numpy()
 
-    corners = surface.vertices[surface.triangles]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    corners = outer.vertices[outer.triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     center = (area[:, None] * corners.mean(axis=1)).sum(axis=0) / area.sum()
     offsets = corners - center
     # The second moments of a triangle: its corners' and their sum's outer products, by the exact formula.
     sums = offsets.sum(axis=1)
     moments = np.einsum("t,tci,tcj->ij", area, offsets, offsets) + np.einsum("t,ti,tj->ij", area, sums, sums)
-    return _model(
-        name, unit, config, digest or _digest(vertices, triangles), surface.vertices, surface.triangles,
-        surface.points, surface.normals, center, moments / (12 * area.sum()), distance, config.symmetry_tolerance,
-    )  # fmt: skip
+    shape = _Shape(center, moments / (12 * area.sum()), distance, config.symmetry_tolerance)
+    return _model(name, unit, outer, shape, digest or _digest(vertices, triangles))
 
 
 def object_from_cloud(
@@ -140,8 +139,9 @@ def object_from_cloud(
 ) -> ObjectModel:
     """Make an object model of a cloud that covers the whole surface, such as a merged scan.
 
-    Without normals they are estimated and oriented consistently, outwards. Raises InputError for fewer points than the
-    config asks for, since a sparse cloud cannot stand for a surface.
+    Without normals they are estimated and oriented consistently, outwards. Symmetries are found to the tolerance
+    plus the spacing of the points. Raises InputError for fewer points than the config asks for, since a sparse
+    cloud cannot stand for a surface.
     """
     import open3d
     from scipy.spatial import cKDTree
@@ -152,63 +152,70 @@ def object_from_cloud(
             f"the cloud has {len(points)} points, but {config.num_points} are needed: scan it more densely"
         )
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
-    if normals is None or not np.isfinite(normals).all() or not (np.linalg.norm(normals, axis=1) > 0).all():
-        cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(30))
-        cloud.orient_normals_consistent_tangent_plane(30)
-    else:
+    given = False
+    if normals is not None and np.isfinite(normals).all() and np.any(normals, axis=1).all():
+        given = True
         cloud.normals = open3d.utility.Vector3dVector(normals.astype(np.float64))
         cloud.normalize_normals()
+    else:
+        cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(30))
+        cloud.orient_normals_consistent_tangent_plane(30)
     if len(points) > 5 * config.num_points:
         rows = np.random.default_rng(config.seed).choice(len(points), 5 * config.num_points, replace=False)
         cloud = cloud.select_by_index(np.sort(rows))
     thinned = cloud.farthest_point_down_sample(config.num_points)
     kept, directions = np.asarray(thinned.points), np.asarray(thinned.normals)
     center = kept.mean(axis=0)
-    if normals is None and ((kept - center) * directions).sum() < 0:
+    if not given and ((kept - center) * directions).sum() < 0:
         directions = -directions
-    tree, spacing = cKDTree(points), float(np.median(cKDTree(kept).query(kept, k=2)[0][:, 1]))
     size = float(np.linalg.norm(np.ptp(kept, axis=0)))
     if not size > 0 or np.linalg.matrix_rank(kept - center, tol=1e-6 * size) < 2:
         raise InputError("the cloud's points coincide or lie on a line: that is not a part's surface")
-    return _model(
-        name, unit, config, digest or _digest(points), points.astype(np.float64), np.zeros((0, 3), np.int32),
-        kept.astype(np.float32), directions.astype(np.float32), center, np.cov(kept.T, bias=True),
-        lambda moved: tree.query(moved)[0], config.symmetry_tolerance + spacing / size,
-    )  # fmt: skip
+    tree, spacing = cKDTree(points), float(np.median(cKDTree(kept).query(kept, k=2)[0][:, 1]))
+    outer = OuterSurface(
+        vertices=points.astype(np.float64),
+        triangles=np.zeros((0, 3), np.int32),
+        points=kept.astype(np.float32),
+        normals=directions.astype(np.float32),
+        area=len(kept) * spacing**2 * 3**0.5 / 2,  # as if packed in hexagons
+        hidden_share=0.0,
+    )
+    tolerance = min(config.symmetry_tolerance + spacing / size, 0.2)
+    shape = _Shape(center, np.cov(kept.T, bias=True), lambda moved: tree.query(moved)[0], tolerance)
+    return _model(name, unit, outer, shape, digest or _digest(points))
 
 
-def _model(
-    name: str,
-    unit: str,
-    config: ObjectConfig,
-    digest: str,
-    vertices: Float[np.ndarray, "v 3"],
-    triangles: Int[np.ndarray, "t 3"],
-    points: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    center: Float[np.ndarray, "3"],
-    moments: Float[np.ndarray, "3 3"],
-    distance: Distance,
-    tolerance: float,
-) -> ObjectModel:
+class _Shape(NamedTuple):
+    """What symmetries are found from; see `find_symmetries`."""
+
+    center: Float[np.ndarray, "3"]
+    moments: Float[np.ndarray, "3 3"]
+    distance: Distance
+    tolerance: float
+
+
+def _model(name: str, unit: str, outer: OuterSurface, shape: _Shape, digest: str) -> ObjectModel:
     from kmn_jax.geometry import farthest_point_indices
 
-    diameter = _diameter(vertices)
-    keypoints = farthest_point_indices(
-        (points - center.astype(np.float32)) / np.float32(diameter), config.num_keypoints
-    )
+    diameter = _diameter(outer.vertices)
+    # Centred and of unit size: float32 then has digits to tell the distances apart.
+    scaled = ((outer.points - shape.center) / diameter).astype(np.float32)
+    order = np.asarray(farthest_point_indices(scaled, len(scaled)))
+    points = outer.points[order]
+    center, moments, distance, tolerance = shape
     return ObjectModel(
         name=name,
         unit=check_unit(unit),
-        vertices=vertices,
-        triangles=triangles,
+        vertices=outer.vertices,
+        triangles=outer.triangles,
         points=points,
-        normals=normals,
-        keypoint_indices=np.asarray(keypoints),
-        minimum=vertices.min(axis=0),
-        maximum=vertices.max(axis=0),
+        normals=outer.normals[order],
+        minimum=outer.vertices.min(axis=0),
+        maximum=outer.vertices.max(axis=0),
         diameter=diameter,
-        symmetries=find_symmetries(points.astype(np.float64), center, moments, distance, diameter, min(tolerance, 0.2)),
+        area=outer.area,
+        hidden_share=outer.hidden_share,
+        symmetries=find_symmetries(points.astype(np.float64), center, moments, distance, diameter, tolerance),
         digest=digest,
     )
 

@@ -27,7 +27,8 @@ class OuterSurface:
     triangles: Int[np.ndarray, "t 3"]
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
-    hidden_share: float  # of the area of the mesh that cannot be seen from outside
+    area: float  # that can be seen
+    hidden_share: float  # of the mesh's area that cannot
 
 
 def outer_surface(
@@ -83,6 +84,7 @@ def outer_surface(
         triangles=renumbered.reshape(-1, 3).astype(np.int32),
         points=point[seen][chosen].astype(np.float32),
         normals=(directions[owner] * signs[:, None])[seen][chosen].astype(np.float32),
+        area=float(doubled_area.sum() / 2 * seen.mean()),
         hidden_share=float(1 - seen.mean()),
     )
 

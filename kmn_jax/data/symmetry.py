@@ -1,7 +1,7 @@
 """Rotations that map an object onto itself, found from its geometry.
 
-Such a rotation fixes the centroid of the surface, and its second moments. So an axis of order three or more is a principal
-axis whose other two moments are equal, an axis of order two is a principal axis or lies in a plane of equal
+Such a rotation fixes the centroid of the surface, and its second moments. So an axis of order three or more is a
+principal axis whose other two moments are equal, an axis of order two is a principal axis or lies in a plane of equal
 moments, and only where all three are equal need every direction be tried.
 """
 

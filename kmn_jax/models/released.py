@@ -10,10 +10,9 @@ from flax import nnx
 from safetensors.numpy import save
 
 from kmn_jax.checks import InputError
-from kmn_jax.files import write_whole
+from kmn_jax.files import read_safetensors, write_whole
 from kmn_jax.models.keymatchnet import KeyMatchNetConfig, Model, model_structure
 from kmn_jax.models.torch_file import read_state_dict, state_dict_bytes
-from kmn_jax.models.weights import read_safetensors
 
 RELEASED_CONFIG = KeyMatchNetConfig(normalization="released", pair_dropout="per_pair")
 

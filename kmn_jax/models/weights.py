@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from kmn_jax.checks import InputError
-from kmn_jax.files import write_whole
+from kmn_jax.files import read_safetensors, write_whole
 from kmn_jax.models.keymatchnet import KeyMatchNetConfig, Model, model_structure
 
 _CONFIG_KEY = "kmn_jax.config"
@@ -35,16 +35,6 @@ def is_model_file(path: str | Path) -> bool:
             return _CONFIG_KEY in (file.metadata() or {})
     except (SafetensorError, OSError):
         return False
-
-
-def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Return tensors and header of a .safetensors file, or raise InputError."""
-    try:
-        with safe_open(str(path), "np") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a mapping)
-            return tensors, file.metadata() or {}
-    except (SafetensorError, OSError, AttributeError, TypeError) as error:  # the latter two: dtypes NumPy lacks
-        raise InputError(f"{path} is not a readable safetensors file: {error}") from None
 
 
 def load_model(path: str | Path) -> Model:
