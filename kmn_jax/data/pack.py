@@ -267,8 +267,8 @@ def _decode(tensors: dict[str, np.ndarray], header: dict[str, str], path: Path) 
         ends = np.cumsum(tensors["copies"], dtype=np.int64)
         drops = []
         for index, (end, copies) in enumerate(zip(ends, tensors["copies"], strict=True)):
-            *focal, width, height = tensors["views"][index].tolist()
-            camera = Camera(*focal, width=round(width), height=round(height))
+            fx, fy, cx, cy, width, height = tensors["views"][index].tolist()
+            camera = Camera(fx, fy, cx, cy, round(width), round(height))
             scene = BinScene(
                 Bin(*tensors["bins"][index].tolist()), poses[end - copies : end], camera, T_camera_bin[index]
             )
