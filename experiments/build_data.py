@@ -1,8 +1,12 @@
-"""Build training packs: `python -m experiments.build_data electronics`.
+"""Build the data: `python -m experiments.build_data electronics`, then `test-sets`.
 
-electronics  1,507 components of KiCad's public library, as `experiments/assets/electronics.json` lists them, each in 20
-             bins of 1 to 20 copies. The models come from `--models`, a folder that holds them as KiCad lays them out,
-             or on Debian and its like from the package kicad-packages3d, which is downloaded (380 MB), not installed.
+electronics  the training pack: 1,507 components of KiCad's public library, as `assets/electronics.json` lists them, in
+             20 bins each, of 1 to 20 copies. The models come from `--models`, a folder that holds them as KiCad lays
+             them out, or on Debian and its like from the package kicad-packages3d, which is downloaded (380 MB) but
+             not installed.
+test-sets    7 electronic and 7 industrial objects in 20 bins each, rendered by ray casting, as BOP datasets; their
+             digests are compared with those in `assets/test_sets.json`.
+small        the few objects and images that the repository carries: `assets/small_pack`, `assets/small_test_set`.
 
 A build goes on where it stopped, however it stopped; objects that cannot be used are listed with the reason.
 """
@@ -11,18 +15,36 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import tyro
 
 from experiments.kicad import catalogue_sources
+from experiments.test_sets import (
+    ASSETS,
+    CONFIG,
+    build_test_set,
+    electronics_sources,
+    industrial_sources,
+    record_digests,
+    verdict,
+)
 from kmn_jax.checks import InputError
 from kmn_jax.data.build import Record, build_pack
 from kmn_jax.data.recipe import PackConfig
 
 OUTPUTS = Path("outputs")
+SMALL_PACK = (
+    "Capacitor_THT.3dshapes/CP_Axial_L21.0mm_D8.0mm_P28.00mm_Horizontal",
+    "Connector_PinHeader_2.54mm.3dshapes/PinHeader_1x07_P2.54mm_Vertical_SMD_Pin1Right",
+    "Battery.3dshapes/BatteryHolder_Keystone_2466_1xAAA",
+    "Button_Switch_SMD.3dshapes/SW_DIP_SPSTx04_Slide_9.78x12.34mm_W8.61mm_P2.54mm",
+    "Diode_THT.3dshapes/D_DO-15_P5.08mm_Vertical_KathodeUp",
+    "Package_TO_SOT_SMD.3dshapes/TSOT-23",
+)
+SMALL_TEST_SET = ("Connector_USB.3dshapes/USB_A_TE_292303-7_Horizontal", "gear_motor")
 
 
 @dataclass(frozen=True)
@@ -39,6 +61,46 @@ class Electronics:
         sources, licence = catalogue_sources(self.models, OUTPUTS / "kicad", self.limit)
         records = build_pack(self.folder, sources, self.pack, workers=self.workers, licence=licence)
         print_summary(self.folder, records)
+
+
+@dataclass(frozen=True)
+class TestSets:
+    """Build the test sets and compare their digests with the recorded ones."""
+
+    folder: Path = OUTPUTS / "test_sets"
+    models: Path | None = None  # as for electronics
+    workers: int | None = None
+    record: bool = False  # write the digests into the repository instead
+
+    def run(self) -> None:
+        sources = {
+            "electronics": electronics_sources(self.models, OUTPUTS / "kicad"),
+            "industrial": industrial_sources(),
+        }
+        digests = {name: build_test_set(self.folder / name, own, workers=self.workers) for name, own in sources.items()}
+        if self.record:
+            record_digests(digests)
+        for name, digest in digests.items():
+            print(f"{self.folder / name}: {digest}: {verdict(name, digest)}")
+
+
+@dataclass(frozen=True)
+class Small:
+    """Build the small pack and test set that the repository carries."""
+
+    folder: Path = ASSETS
+    models: Path | None = None
+    workers: int | None = None
+
+    def run(self) -> None:
+        sources, licence = catalogue_sources(self.models, OUTPUTS / "kicad", None)
+        chosen = [source for source in sources if source.name in SMALL_PACK]
+        config = PackConfig(drops=10, copies=(2, 20))
+        records = build_pack(self.folder / "small_pack", chosen, config, workers=self.workers, licence=licence)
+        print_summary(self.folder / "small_pack", records)
+        tests = [source for source in [*sources, *industrial_sources()] if source.name in SMALL_TEST_SET]
+        folder = self.folder / "small_test_set"
+        print(folder, build_test_set(folder, tests, replace(CONFIG, drops=4, copies=(3, 18)), self.workers))
 
 
 def print_summary(folder: Path, records: list[Record]) -> None:
@@ -73,7 +135,7 @@ def print_summary(folder: Path, records: list[Record]) -> None:
 def main() -> None:
     """Run one of the builds."""
     try:
-        tyro.extras.subcommand_cli_from_dict({"electronics": Electronics}).run()
+        tyro.extras.subcommand_cli_from_dict({"electronics": Electronics, "test-sets": TestSets, "small": Small}).run()
     except InputError as error:
         sys.exit(f"error: {error}")
 

@@ -15,6 +15,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, TimeoutError, wait
 from dataclasses import asdict, dataclass
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,12 @@ def build_pack(
     return [journal.records[name] for name in wanted]
 
 
+def one_thread_a_process() -> None:
+    """Let processes started from now on use one core each, so that as many as there are cores fill them."""
+    # Libraries read these when they are imported.
+    os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+
+
 def _write_manifest(
     folder: Path, journal: _Journal, wanted: dict[str, Source], config: PackConfig, facts: dict[str, Any]
 ) -> None:
@@ -95,12 +102,9 @@ def _made(folder: Path, sources: list[Source], config: PackConfig, workers: int,
 
     if not sources:
         return
-    # One thread a process: the processes fill the cores. Set before they start, as libraries read it on import.
-    os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
-    import multiprocessing
-
+    one_thread_a_process()
     # Fresh processes now and then give back what readers leak.
-    with ProcessPool(workers, max_tasks=50, context=multiprocessing.get_context("spawn")) as pool:
+    with ProcessPool(workers, max_tasks=50, context=get_context("spawn")) as pool:
         pending: dict[Future[Record], Source] = {}
         queue = iter(sources)
         try:

@@ -1,4 +1,4 @@
-"""One object from its CAD file to its place in a pack: model, collision shape, drops, views, visibility."""
+"""From one CAD file to its scenes: model, collision shape, drops, views; then visibility bits for a pack, or images."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import Int, UInt8
 
 from kmn_jax.checks import InputError
+from kmn_jax.data.bop import BopFrame, scene_frame
 from kmn_jax.data.cad import ObjectConfig, ObjectModel, load_object
 from kmn_jax.data.hulls import CollisionShape, HullConfig, collision_shape
 from kmn_jax.data.pack import Drop, PackedObject, quantised
 from kmn_jax.data.physics import BinConfig, DropResult, settle
-from kmn_jax.data.raycast import RayMesh, pack_bits, visible_bin_surfels, visible_surfels
+from kmn_jax.data.raycast import RayMesh, pack_bits, render, visible_bin_surfels, visible_surfels
 from kmn_jax.data.scene import BinScene
 from kmn_jax.data.views import CameraConfig, place_camera
 
@@ -125,6 +126,12 @@ def visibility_bits(
         pack_bits(visible_surfels(mesh, scene, item.points, item.normals)),
         pack_bits(visible_bin_surfels(mesh, scene, np.asarray(floor.points), np.asarray(floor.normals))),
     )
+
+
+def exact_frame(mesh: RayMesh, scene: BinScene, object_id: int) -> BopFrame:
+    """Render a scene by ray casting, as a frame of a BOP dataset with visible masks, in the scene's unit."""
+    seen = render(mesh, scene)
+    return scene_frame(scene, object_id, seen.depth, seen.instances, seen.total_pixels, seen.total_boxes)
 
 
 def _without_drops(model: ObjectModel, name: str, split: str) -> PackedObject:

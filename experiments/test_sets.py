@@ -1,0 +1,90 @@
+"""The test sets: 7 electronic and 7 industrial objects, each in 20 bins of 1 to 20 copies, rendered by ray casting.
+
+They are BOP datasets, `outputs/test_sets/electronics` and `.../industrial`, one scene an object, one image a bin. They
+are not part of the repository; `assets/test_sets.json` holds their digests with the versions that made them.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from importlib.metadata import version
+from multiprocessing import get_context
+from pathlib import Path
+
+from experiments.kicad import catalogue_sources
+from kmn_jax.data.bop import BopDataset, dataset_digest, finest_depth_scale, write_camera, write_models, write_scene
+from kmn_jax.data.build import Source, one_thread_a_process
+from kmn_jax.data.cad import ObjectModel, load_object
+from kmn_jax.data.hulls import collision_shape
+from kmn_jax.data.raycast import RayMesh
+from kmn_jax.data.recipe import PackConfig, bin_scenes, exact_frame
+
+ASSETS = Path(__file__).parent / "assets"
+DIGESTS = ASSETS / "test_sets.json"
+SPLIT = "test"
+CONFIG = PackConfig(seed=1)  # another seed than the training pack's
+_LIBRARIES = ("cascadio", "mujoco", "numpy", "open3d", "scipy", "trimesh")
+
+
+def industrial_sources() -> list[Source]:
+    """Return the committed industrial parts."""
+    return [Source(path.stem, "test", path) for path in sorted((ASSETS / "industrial").glob("*.stl"))]
+
+
+def electronics_sources(models: Path | None, cache: Path) -> list[Source]:
+    """Return the held-out electronic components; see `catalogue_sources`."""
+    return [source for source in catalogue_sources(models, cache, None)[0] if source.split == "test"]
+
+
+def build_test_set(folder: Path, sources: list[Source], config: PackConfig = CONFIG, workers: int | None = None) -> str:
+    """Write a test set, but for scenes that exist, and return its digest."""
+    from tqdm import tqdm
+
+    numbered = list(enumerate(sources, start=1))
+    missing = [item for item in numbered if not (folder / SPLIT / f"{item[0]:06d}").exists()]
+    one_thread_a_process()
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        made = [pool.submit(_write_scene, folder, config, *item) for item in missing]
+        for future in tqdm(as_completed(made), total=len(made), unit="object", desc=folder.name):
+            future.result()
+        models = pool.map(_model, [source.path for source in sources])
+        write_models(folder, {object_id: model for (object_id, _), model in zip(numbered, models, strict=True)})
+    frame = BopDataset.open(folder, SPLIT)[0]
+    write_camera(folder, frame.camera, finest_depth_scale(float(frame.depth.max()), "mm"))
+    return dataset_digest(folder)
+
+
+def verdict(name: str, digest: str) -> str:
+    """Say how a test set's digest compares with the one that the repository holds."""
+    record = json.loads(DIGESTS.read_text(encoding="utf-8")) if DIGESTS.exists() else {}
+    if record.get("sets", {}).get(name) == digest:
+        return "as recorded"
+    differing = {key: value for key, value in made_with().items() if record.get("made_with", {}).get(key) != value}
+    reason = f"made with other versions ({differing})" if differing else "with the same versions: please report it"
+    return f"differs from {DIGESTS.name}, {reason}"
+
+
+def record_digests(digests: dict[str, str]) -> None:
+    """Write the digests into the repository, with the versions that they hold for."""
+    DIGESTS.write_text(json.dumps({"made_with": made_with(), "sets": digests}, indent=1) + "\n", encoding="utf-8")
+
+
+def made_with() -> dict[str, str]:
+    """Return what decides the last bit of a scene: library versions and processor architecture."""
+    return {"machine": platform.machine(), **{name: version(name) for name in _LIBRARIES}}
+
+
+def _model(path: Path) -> ObjectModel:
+    return load_object(path).in_unit("m")
+
+
+def _write_scene(folder: Path, config: PackConfig, object_id: int, source: Source) -> None:
+    model = _model(source.path)
+    mesh = RayMesh(model.vertices, model.triangles)
+    shape = collision_shape(model.vertices, model.triangles, config.hulls)
+    scenes, _ = bin_scenes(shape, config, int(model.digest[:8], 16))
+    frames = [exact_frame(mesh, scene, object_id) for scene in scenes]
+    farthest = max(float(frame.depth.max()) for frame in frames)
+    write_scene(folder, SPLIT, object_id, frames, "m", finest_depth_scale(farthest, "m"))
