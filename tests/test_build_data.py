@@ -1,0 +1,182 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import kicad, test_sets
+from experiments.build_data import SMALL_PACK
+from experiments.kicad import catalogue_sources
+from kmn_jax.checks import InputError
+from kmn_jax.data.bop import BopDataset
+from kmn_jax.data.mesh_files import read_mesh
+from kmn_jax.data.pack import Pack
+from kmn_jax.data.raycast import RayMesh, render
+from kmn_jax.data.scene import BinScene
+
+ROOT = Path(__file__).parents[1]
+ASSETS = test_sets.ASSETS
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", *arguments], cwd=ROOT, capture_output=True, text=True)
+
+
+def test_takes_models_from_a_folder_with_the_splits_mixed(tmp_path: Path) -> None:
+    sources, licence = catalogue_sources(tmp_path, tmp_path / "unused", 60)
+    assert len(sources) == 60
+    assert {source.split for source in sources} == {"train", "validation"}
+    assert all(source.path == tmp_path / f"{source.name}.step" for source in sources)
+    assert "CC-BY-SA" in licence
+    everything, _ = catalogue_sources(tmp_path, tmp_path / "unused", None)
+    assert len({source.name for source in everything}) == 1507
+    assert everything[:60] == sources
+    assert not (tmp_path / "unused").exists()
+
+
+def test_says_where_models_come_from_without_debian(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kicad.shutil, "which", lambda name: None)
+    with pytest.raises(InputError, match=r"this is not a Debian system.*name their folder with --models"):
+        catalogue_sources(None, tmp_path / "cache", 1)
+    with pytest.raises(InputError, match=r"is not a folder: name the one that holds KiCad's"):
+        catalogue_sources(tmp_path / "absent", tmp_path / "cache", 1)
+
+
+def test_extracts_only_what_is_named_from_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not kicad.shutil.which("dpkg-deb"):
+        pytest.skip("dpkg-deb is not here: Debian packages cannot be made or read")
+    names = ["Family.3dshapes/part,1", "Family.3dshapes/other [2]"]
+    inside = tmp_path / "root" / "usr/share/kicad/3dmodels/Family.3dshapes"
+    inside.mkdir(parents=True)
+    for name in ("part,1", "other [2]", "unwanted"):
+        (inside / f"{name}.step").write_text(name)
+    control = tmp_path / "root" / "DEBIAN"
+    control.mkdir()
+    (control / "control").write_text(
+        "Package: kicad-packages3d\nVersion: 1\nArchitecture: all\nMaintainer: nobody <nobody@localhost>\n"
+        "Description: test\n"
+    )
+
+    def download(command: list[str], folder: str, failure: str, check: bool = True) -> None:
+        if command[0] == "apt-get":
+            command = ["dpkg-deb", "--build", str(tmp_path / "root"), f"{folder}/kicad-packages3d_1_all.deb"]
+        original(command, folder, failure, check)
+
+    original = kicad._run
+    monkeypatch.setattr(kicad, "_run", download)
+    kicad._extract_missing(names, tmp_path / "cache")
+    assert sorted(path.name for path in (tmp_path / "cache").rglob("*.*") if path.is_file()) == (
+        ["other [2].step", "part,1.step"]
+    )
+    assert (tmp_path / "cache" / f"{names[0]}.step").read_text() == "part,1"
+    with pytest.raises(InputError, match=r"does not hold Family\.3dshapes/absent\.step"):
+        kicad._extract_missing(["Family.3dshapes/absent"], tmp_path / "cache")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["electronics", "--models", "absent"], "error: absent is not a folder"),
+        (["electronics", "--pack.drops", "0"], "drops = 0 must be 1 or more"),
+    ],
+)
+def test_build_data_ends_with_one_sentence_for_bad_input(arguments: list[str], message: str) -> None:
+    result = run("experiments.build_data", *arguments)
+    assert result.returncode != 0
+    assert message in result.stderr + result.stdout
+    assert "Traceback" not in result.stderr
+
+
+def test_small_pack_is_whole_and_of_the_recipe() -> None:
+    pack = Pack(ASSETS / "small_pack")
+    assert pack.problems() == []
+    assert sorted(pack.names()) == sorted(SMALL_PACK)
+    assert (len(pack.names("train")), len(pack.names("validation"))) == (4, 2)
+    assert "CC-BY-SA 4.0" in pack.manifest["licence"]
+    for name in pack.names():
+        item = pack.load(name)
+        assert [len(drop.scene.T_bin_object) for drop in item.drops] == [2, 4, 6, 8, 10, 12, 14, 16, 18, 20]
+        extents = np.linalg.norm(np.ptp(item.points, axis=0))
+        assert 0.95 * item.diameter < extents < 3**0.5 * item.diameter
+        for drop in item.drops:
+            assert drop.bits is not None
+            visible = np.unpackbits(drop.bits, axis=1).mean(axis=1)
+            assert 0.05 < visible.mean() < 0.6  # at most about half of a surface faces the camera
+            at = np.einsum("nij,pj->npi", drop.scene.T_bin_object[:, :3, :3], item.points)
+            at = at + drop.scene.T_bin_object[:, None, :3, 3]
+            half = np.array([drop.scene.bin.length, drop.scene.bin.width]) / 2
+            assert (np.abs(at[..., :2]) < half + 0.004 * item.diameter).all()
+            assert at[..., 2].min() > -0.004 * item.diameter
+
+
+@pytest.mark.parametrize("object_id", [1, 2])
+def test_poses_of_the_small_test_set_reproject(object_id: int, record_property: pytest.RecordProperty) -> None:
+    """The stored depth is what the stored models, poses, camera and bin give, to half a quantisation step."""
+    folder = ASSETS / "small_test_set"
+    dataset = BopDataset.open(folder, "test")
+    assert dataset.problems() == ()
+    model = dataset.model(object_id)
+    assert model.path is not None
+    loaded = read_mesh(model.path, "mm")
+    mesh = RayMesh(loaded.vertices, loaded.triangles)
+    cameras = json.loads((folder / "test" / f"{object_id:06d}" / "scene_camera.json").read_text())
+    frames = [key for key in dataset.keys if key.scene_id == object_id]
+    assert len(frames) == 4
+    for key in frames:
+        frame = dataset.frame(*key, masks=True)
+        assert frame.instances is not None
+        assert frame.bin is not None
+        assert frame.T_camera_bin is not None
+        poses = np.stack([instance.T_camera_object for instance in frame.instances])
+        T_bin_object = np.linalg.inv(frame.T_camera_bin) @ poses
+        seen = render(mesh, BinScene(frame.bin, T_bin_object, frame.camera, frame.T_camera_bin))
+        on_object = (seen.instances >= 0) & (seen.instances < len(poses)) & (frame.depth > 0)
+        step = cameras[str(key.image_id)]["depth_scale"]
+        error = np.abs(seen.depth - frame.depth)[on_object]
+        record_property("median depth error over the step", f"{np.median(error) / step:.2f}")
+        assert np.median(error) < step / 2 * 1.01
+        assert np.percentile(error, 99) < 2 * step
+        assert frame.visible_masks is not None
+        same = frame.visible_masks == (seen.instances == np.arange(len(poses))[:, None, None])
+        assert same.mean() > 0.9999
+        stored = np.array([instance.visible_fraction for instance in frame.instances])
+        np.testing.assert_allclose(seen.visible_fraction, stored, atol=0.005)
+
+
+def test_digests_of_the_test_sets_are_recorded_with_what_made_them() -> None:
+    record = json.loads(test_sets.DIGESTS.read_text())
+    assert set(record["sets"]) == {"electronics", "industrial"}
+    assert set(record["made_with"]) == set(test_sets.made_with())
+    assert len(test_sets.industrial_sources()) == 7
+    assert "differs from test_sets.json" in test_sets.verdict("electronics", "0" * 64)
+    if record["made_with"] == test_sets.made_with():
+        assert test_sets.verdict("electronics", record["sets"]["electronics"]) == "as recorded"
+
+
+def test_shows_pack_and_test_set(tmp_path: Path) -> None:
+    result = run(
+        "experiments.show_data",
+        "--folder",
+        str(tmp_path),
+        "--objects",
+        "1",
+        "--drops",
+        "2",
+        "--crops.num-points",
+        "256",
+    )
+    assert result.returncode == 0, result.stderr
+    pictures = sorted(tmp_path.glob("*.png"))
+    assert [picture.name[:5] for picture in pictures] == ["pack_", "small"]
+    assert all(picture.stat().st_size > 20_000 for picture in pictures)
+
+
+def test_show_data_names_what_is_missing(tmp_path: Path) -> None:
+    result = run("experiments.show_data", "--pack", str(tmp_path), "--folder", str(tmp_path / "pictures"))
+    assert result.returncode == 1
+    assert result.stderr.startswith("error: ")
+    assert "manifest.json cannot be read" in result.stderr
