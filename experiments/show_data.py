@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.bop import BopDataset, BopFrame
 from kmn_jax.data.crops import Crop, CropConfig, draw_crop
-from kmn_jax.data.pack import Drop, Pack, PackedObject
-from kmn_jax.data.splat import BIN, BinInView, Surfels, VisiblePoints, visible_from_bits
+from kmn_jax.data.device_pack import DevicePack, stack_pack, take_scene, visible_points
+from kmn_jax.data.pack import Pack
+from kmn_jax.data.splat import BIN, VisiblePoints
 from kmn_jax.geometry import depth_normals
 
 ASSETS = Path(__file__).parent / "assets"
@@ -47,7 +49,7 @@ class ShowData:
         if self.pack is not None:
             pack = Pack(self.pack)
             for name in _spread(pack.names(), self.objects):
-                self._save(_pack_figure(pack.load(name), self), f"pack_{Path(name).name}.png")
+                self._save(_pack_figure(pack, name, self), f"pack_{Path(name).name}.png")
         if self.test_set is not None:
             dataset = BopDataset.open(self.test_set, self.split)
             scenes = sorted({key.scene_id for key in dataset.keys})
@@ -67,38 +69,31 @@ def _spread(items: list[Any], count: int) -> list[Any]:
     return [items[index] for index in chosen]
 
 
-def _pack_figure(item: PackedObject, show: ShowData) -> Any:
-    drops = _spread([drop for drop in item.drops if drop.bits is not None], show.drops)
-    if not drops:
-        raise InputError(
-            f"{item.name}: the pack has no visibility bits, so there is nothing to draw: build it with them"
-        )
-    figure, axes = _figure(len(drops), 4, f"{item.name}: {item.split}, diameter {1000 * item.diameter:.1f} mm")
-    for row, (drop, key) in enumerate(zip(drops, jax.random.split(jax.random.key(show.seed), len(drops)), strict=True)):
-        visible, crop = _draw(item, drop, key, show)
+def _pack_figure(pack: Pack, name: str, show: ShowData) -> Any:
+    item, stacked = pack.load(name, visibility=False), stack_pack(pack, [name])
+    drops = _spread(list(range(len(item.drops))), show.drops)
+    figure, axes = _figure(len(drops), 4, f"{name}: {item.split}, diameter {1000 * item.diameter:.1f} mm")
+    for row, drop, key in zip(axes, drops, jax.random.split(jax.random.key(show.seed), len(drops)), strict=True):
+        scene = item.drops[drop].scene
+        visible, crop = _drawn(stacked.arrays, jnp.int32(drop), key, show.keypoints, show.crops)
         seen = np.asarray(visible.mask)
-        pixels = np.asarray(visible.points)[seen] @ drop.scene.camera.matrix.T
-        instance = np.asarray(visible.instance)[seen]
-        _scatter(axes[row][0], pixels[:, :2] / pixels[:, 2:], _instance_colors(instance), 0.3)
-        seed = drop.scene.camera.matrix @ np.asarray(crop.seed)
-        axes[row][0].plot(*(seed[:2] / seed[2]), "k+", markersize=14, markeredgewidth=2)
-        axes[row][0].set_title(f"{len(drop.scene.T_bin_object)} copies, visible surfels, + seed")
-        _crop_row(axes[row][1:], crop, show)
+        pixels = np.asarray(visible.points)[seen] @ scene.camera.matrix.T
+        _scatter(row[0], pixels[:, :2] / pixels[:, 2:], _instance_colors(np.asarray(visible.instance)[seen]), 0.3)
+        seed = scene.camera.matrix @ np.asarray(crop.seed)
+        row[0].plot(*(seed[:2] / seed[2]), "k+", markersize=14, markeredgewidth=2)
+        row[0].set_title(f"{len(scene.T_bin_object)} copies, visible surfels, + seed")
+        _crop_row(row[1:], crop, show)
     return figure
 
 
-def _draw(item: PackedObject, drop: Drop, key: jax.Array, show: ShowData) -> tuple[VisiblePoints, Crop]:
-    poses = jnp.asarray(drop.scene.T_camera_object, jnp.float32)
-    bin = drop.scene.bin
-    in_view = BinInView(
-        jnp.array([bin.length, bin.width, bin.height], jnp.float32), jnp.asarray(drop.scene.T_camera_bin, jnp.float32)
-    )
-    surfels = Surfels(jnp.asarray(item.points), jnp.asarray(item.normals), jnp.float32(item.area))
-    visible = visible_from_bits(
-        surfels, poses, jnp.ones(len(poses), bool), jnp.asarray(drop.bits), in_view, jnp.asarray(drop.bin_bits)
-    )
-    keypoints = surfels.points[: show.keypoints]
-    return visible, draw_crop(key, visible, keypoints, poses, jnp.float32(item.diameter), show.crops)
+@partial(jax.jit, static_argnames=("num_keypoints", "config"))
+def _drawn(
+    arrays: DevicePack, drop: Int[Array, ""], key: jax.Array, num_keypoints: int, config: CropConfig
+) -> tuple[VisiblePoints, Crop]:
+    scene = take_scene(arrays, jnp.int32(0), drop)
+    visible = visible_points(scene)
+    keypoints = scene.surfels.points[:num_keypoints]
+    return visible, draw_crop(key, visible, keypoints, scene.T_camera_object, scene.diameter, config)
 
 
 def _crop_row(axes: Any, crop: Crop, show: ShowData) -> None:
