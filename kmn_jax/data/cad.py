@@ -195,11 +195,13 @@ class _Shape(NamedTuple):
 
 
 def _model(name: str, unit: str, outer: OuterSurface, shape: _Shape, digest: str) -> ObjectModel:
+    import jax.numpy as jnp
+
     from kmn_jax.geometry import farthest_point_indices
 
     diameter = _diameter(outer.vertices)
     # Centred and of unit size: float32 then has digits to tell the distances apart.
-    scaled = ((outer.points - shape.center) / diameter).astype(np.float32)
+    scaled = jnp.asarray((outer.points - shape.center) / diameter, jnp.float32)
     order = np.asarray(farthest_point_indices(scaled, len(scaled)))
     points = outer.points[order]
     center, moments, distance, tolerance = shape
