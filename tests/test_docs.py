@@ -19,6 +19,12 @@ EXAMPLES = [
     for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
     for number, match in enumerate(BLOCK.finditer(path.read_text(encoding="utf-8")), start=1)
 ]
+ASSETS = ROOT / "experiments" / "assets"
+FILES = {
+    "part_file": ASSETS / "industrial" / "gear_motor.stl",
+    "small_pack": ASSETS / "small_pack",
+    "small_test_set": ASSETS / "small_test_set",
+}
 GIVEN = {
     "cloud": lambda: box_cloud(0, 2048),
     "keypoint_indices": lambda: np.arange(20) * 100,
@@ -35,4 +41,7 @@ def test_example_runs(path: Path, block: re.Match[str], tmp_path: Path, monkeypa
     if "checkpoint" in names:
         names.remove("checkpoint")
         (tmp_path / "keymatchnet.t7").write_bytes(state_dict_bytes(draw_state_dict(0)))
+    for name in [name for name in names if name in FILES]:
+        names.remove(name)
+        (tmp_path / FILES[name].name).symlink_to(FILES[name])
     exec(code, {"__name__": "__main__"} | {name: GIVEN[name]() for name in names})
