@@ -1,0 +1,51 @@
+"""Normals of some points from all points within a radius: far cheaper than the nearest neighbours of each."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from kmn_jax.checks import positive_scalar
+from kmn_jax.geometry.knn import squared_distances
+from kmn_jax.geometry.normals import _plane_normals
+from kmn_jax.geometry.rows import real_rows
+from kmn_jax.typing import Scalar
+
+_BLOCK = 128  # queries at once: their distances to a few thousand points stay in a core's cache
+
+
+def normals_within_radius(
+    queries: Float[Array, "q 3"],
+    points: Float[Array, "n 3"],
+    radius: Scalar | float | int,
+    mask: Bool[Array, " n"] | None = None,
+) -> tuple[Float[Array, "q 3"], Bool[Array, " q"]]:
+    """Return unit normals at the queries, of arbitrary sign, and which of them are valid.
+
+    A normal is the direction in which the points within the radius spread least. Where they are fewer than three,
+    coincident or on a line, the normal is zero and not valid. Points masked out or not finite are ignored; queries
+    must be finite. Sums are taken about the mean of the points, so a radius below a thousandth of the cloud's extent
+    loses digits. Raises InputError for a radius that is not positive.
+    """
+    radius = positive_scalar(radius, "radius").astype(jnp.float32)
+    count = queries.shape[0]
+    if 0 in (count, points.shape[0]):
+        return jnp.zeros((count, 3)), jnp.zeros(count, dtype=bool)
+    real = real_rows(points, mask)
+    points = jnp.where(real[:, None], points, 0).astype(jnp.float32)
+    center = points.sum(axis=0, keepdims=True) / jnp.maximum(real.sum(), 1).astype(jnp.float32)
+    points, queries = points - center, queries.astype(jnp.float32) - center
+    x, y, z = points.T
+    moments = jnp.stack([jnp.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z], axis=1)
+    moments = jnp.where(real[:, None], moments, 0)
+
+    def sums(block: Float[Array, "b 3"]) -> Float[Array, "b 10"]:
+        near = squared_distances(block, points) <= radius**2
+        return jnp.matmul(near.astype(jnp.float32), moments, precision=jax.lax.Precision.HIGHEST)
+
+    num_blocks = -(-count // _BLOCK)
+    blocks = jnp.pad(queries, ((0, num_blocks * _BLOCK - count), (0, 0))).reshape(num_blocks, _BLOCK, 3)
+    number, *rest = jax.lax.map(sums, blocks).reshape(-1, 10)[:count].T
+    normals, valid = _plane_normals(number, rest[:3], rest[3:])
+    return jnp.where(valid[:, None], normals, 0), valid
