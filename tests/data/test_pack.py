@@ -51,7 +51,8 @@ def random_scene(rng: np.random.Generator, copies: int) -> BinScene:
     T_camera_bin = np.eye(4)
     T_camera_bin[:3, :3] = Rotation.from_euler("xyz", [170, 5, 20], degrees=True).as_matrix()
     T_camera_bin[:3, 3] = [0.01, -0.02, 0.3]
-    return BinScene(Bin(0.14, 0.1, 0.05, 0.002), T_bin_object, Camera(1000.0, 1001.0, 485.5, 299.5, 972, 600), T_camera_bin)
+    camera = Camera(1000.0, 1001.0, 485.5, 299.5, 972, 600)
+    return BinScene(Bin(0.14, 0.1, 0.05, 0.002), T_bin_object, camera, T_camera_bin)
 
 
 def write_pack(folder: Path, *items: PackedObject) -> Pack:
