@@ -3,30 +3,40 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import tempfile
+import io
+import logging
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float64, Int32, Int64
 
 from kmn_jax.checks import InputError
+from kmn_jax.data.cloud_files import parse_pcd, parse_xyz
+from kmn_jax.data.obj_files import parse_obj
+from kmn_jax.data.ply_files import parse_ply
+from kmn_jax.data.step_files import step_to_glb
+from kmn_jax.data.stl_files import parse_stl
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}  # one of each unit, in metres
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb", ".step", ".stp")
 CLOUD_SUFFIXES = (".ply", ".pcd", ".xyz", ".xyzn")
+_FARTHEST = 1e18  # the squares of longer lengths leave float32
 _OWN_UNIT = {".glb": "m", ".step": "m", ".stp": "m"}  # STEP files state theirs; cascadio converts it to metres
+
+
+_Parsed = tuple[Float64[np.ndarray, "v 3"], Float64[np.ndarray, "v 3"] | None, Int64[np.ndarray, "t 3"]]
 
 
 @dataclass(frozen=True)
 class Mesh:
     """Triangles as a file holds them, or a cloud if there are none. Frame and winding are the file's own."""
 
-    vertices: Float[np.ndarray, "v 3"]
-    triangles: Int[np.ndarray, "t 3"]
-    normals: Float[np.ndarray, "v 3"] | None  # of a cloud whose file has them
+    vertices: Float64[np.ndarray, "v 3"]
+    triangles: Int32[np.ndarray, "t 3"]
+    normals: Float64[np.ndarray, "v 3"] | None  # of a cloud whose file has them
     unit: str
 
 
@@ -52,97 +62,100 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     own = _OWN_UNIT.get(suffix)
     if own and unit not in (None, own):
         raise InputError(f"{path}: {suffix} files are read in metres, so the unit cannot be {unit}: leave it out")
-    unit = check_unit(unit or own or "mm")
+    unit = check_unit((own or "mm") if unit is None else unit)
+    content = _read(path)
     try:
-        size = path.stat().st_size
+        vertices, normals, triangles = _parse(content, suffix)
+        _check(vertices, triangles, suffix)
+    except InputError as error:
+        raise InputError(f"{path} cannot be used: {error}") from None
+    except MemoryError:
+        raise InputError(f"{path} cannot be used: it does not fit into memory") from None
+    return Mesh(vertices, triangles.astype(np.int32), None if len(triangles) else normals, unit)
+
+
+def _read(path: Path) -> bytes:
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path} is {'a folder' if path.is_dir() else 'not a regular file'}: name a CAD file")
+        content = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
-    if path.is_dir() or size == 0:
-        raise InputError(f"{path} is {'a folder' if path.is_dir() else 'empty (0 bytes)'}: name a CAD file")
-    vertices, triangles = (np.zeros((0, 3)), np.zeros((0, 3), np.int64))
-    if suffix in MESH_SUFFIXES:
-        vertices, triangles = _read_triangles(path, suffix)
-    normals = None
-    if len(triangles) == 0 and suffix in CLOUD_SUFFIXES:
-        vertices, normals = _read_cloud(path)
-    if len(vertices) == 0 or (len(triangles) == 0 and suffix not in CLOUD_SUFFIXES):
-        raise InputError(f"{path} holds no triangles: it is empty, truncated or not a {suffix} file")
-    bad = ~np.isfinite(vertices).all(axis=1)
+    except ValueError as error:  # a null character
+        raise InputError(f"{str(path)!r} cannot be read: {error}") from None
+    if not content:
+        raise InputError(f"{path} is empty (0 bytes): name a CAD file")
+    return content
+
+
+def _parse(content: bytes, suffix: str) -> _Parsed:
+    none = np.zeros((0, 3), np.int64)
+    if suffix == ".stl":
+        vertices = parse_stl(content).reshape(-1, 3)
+        return vertices, None, np.arange(len(vertices)).reshape(-1, 3)
+    if suffix == ".obj":
+        vertices, triangles = parse_obj(content)
+        return vertices, None, triangles
+    if suffix == ".ply":
+        return parse_ply(content)
+    if suffix == ".pcd":
+        return *parse_pcd(content), none
+    if suffix in (".xyz", ".xyzn"):
+        return *parse_xyz(content, with_normals=suffix == ".xyzn"), none
+    if suffix == ".glb":
+        return _parse_glb(content, merge=False)
+    return _parse_glb(step_to_glb(content), merge=True)
+
+
+def _parse_glb(content: bytes, merge: bool) -> _Parsed:
+    if content[:4] != b"glTF" or int.from_bytes(content[8:12], "little") != len(content):
+        raise InputError("it is truncated, or not a GLB file")
+    import trimesh
+
+    try:
+        with _quiet("trimesh"):
+            scene = trimesh.load_scene(io.BytesIO(content), file_type="glb", process=False, merge_primitives=merge)
+            parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+            vertices = [np.asarray(part.vertices, dtype=np.float64) for part in parts]
+            starts = np.cumsum([0] + [len(part) for part in vertices])
+            triangles = [
+                np.asarray(part.faces, dtype=np.int64) + start for part, start in zip(parts, starts, strict=False)
+            ]
+    except Exception as error:  # the reader has no error of its own, but all that Python has
+        reason = str(error).strip().partition("\n")[0][:120]
+        raise InputError(f"it is damaged ({type(error).__name__}: {reason})") from None
+    if not parts:
+        return np.zeros((0, 3)), None, np.zeros((0, 3), np.int64)
+    return np.concatenate(vertices), None, np.concatenate(triangles)
+
+
+def _check(vertices: Float64[np.ndarray, "v 3"], triangles: Int64[np.ndarray, "t 3"], suffix: str) -> None:
+    if len(triangles) == 0 and suffix not in CLOUD_SUFFIXES:
+        raise InputError(f"it holds no triangles: it is empty, truncated or not a {suffix} file")
+    if len(vertices) == 0:
+        raise InputError("it holds no points")
+    bad = ~(np.abs(vertices) <= _FARTHEST).all(axis=1)
     if bad.any():
         raise InputError(
-            f"{path}: {bad.sum()} of {len(bad)} vertices are NaN or infinite, the first is number"
+            f"{bad.sum()} of its {len(bad)} vertices are NaN, infinite or beyond {_FARTHEST:g}, the first is number"
             f" {int(bad.argmax())}: export the part again"
         )
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(vertices)):
-        raise InputError(f"{path}: triangles name vertices outside of 0..{len(vertices) - 1}: export the part again")
-    return Mesh(vertices, triangles.astype(np.int32), normals, unit)
-
-
-def _read_triangles(path: Path, suffix: str) -> tuple[np.ndarray, np.ndarray]:
-    import trimesh
-
-    if suffix == ".stl":
-        _check_stl_length(path)
-    try:
-        with _silence() if suffix in (".step", ".stp") else contextlib.nullcontext():
-            loaded = trimesh.load_scene(path, process=False)
-    except ImportError as error:
         raise InputError(
-            f"{path} needs a reader that is not installed ({error}): pip install 'kmn_jax[data]'"
-        ) from None
-    except Exception as error:  # every loader has errors of its own, none of them about the file as a whole
-        raise InputError(f"{path} cannot be read as {suffix}: it is truncated or damaged ({_brief(error)})") from None
-    parts = [part for part in loaded.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    if not parts:
-        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
-    triangles = [np.asarray(part.faces, dtype=np.int64) + start for part, start in zip(parts, starts, strict=True)]
-    return np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts]), np.concatenate(triangles)
-
-
-def _check_stl_length(path: Path) -> None:
-    """Refuse truncated STL files, which readers take for shorter or empty ones."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(84)
-        file.seek(max(0, size - 400))
-        tail = file.read().rstrip(b"\0 \t\r\n").lower()
-    declared = int.from_bytes(head[80:84], "little") if len(head) == 84 else -1
-    if declared >= 0 and size == 84 + 50 * declared:
-        return
-    if head.lstrip().lower().startswith(b"solid"):
-        if b"endsolid" not in tail:
-            raise InputError(f"{path} is truncated: it has no 'endsolid' at its end")
-    elif declared < 0 or size < 84 + 50 * declared:
-        raise InputError(
-            f"{path} is truncated or not an STL file: it has {size} bytes"
-            + (f", but announces {declared} triangles, which take {84 + 50 * declared}" if declared >= 0 else "")
+            f"its triangles name vertices from {triangles.min()} to {triangles.max()}, but it has 0 to"
+            f" {len(vertices) - 1}: export the part again"
         )
 
 
-def _read_cloud(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    import open3d
-
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error), _silence():
-        cloud = open3d.io.read_point_cloud(str(path), remove_nan_points=False, remove_infinite_points=False)
-    return np.asarray(cloud.points).copy(), np.asarray(cloud.normals).copy() if cloud.has_normals() else None
-
-
 @contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Keep what compiled readers print from the user: their failures are reported as errors."""
-    with tempfile.TemporaryFile() as sink:
-        saved = [(number, os.dup(number)) for number in (1, 2)]
-        try:
-            for number, _ in saved:
-                os.dup2(sink.fileno(), number)
+def _quiet(logger: str) -> Iterator[None]:
+    """Keep a reader's log and warnings from the user: what matters is reported as an error."""
+    log = logging.getLogger(logger)
+    before = log.disabled
+    log.disabled = True
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
             yield
-        finally:
-            for number, copy in saved:
-                os.dup2(copy, number)
-                os.close(copy)
-
-
-def _brief(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0][:120]}" if lines else type(error).__name__
+    finally:
+        log.disabled = before
