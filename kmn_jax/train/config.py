@@ -1,0 +1,63 @@
+"""The config of a training run: one tree of the configs that its parts read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from kmn_jax.checks import InputError
+from kmn_jax.data.pipeline import PipelineConfig
+from kmn_jax.models import KeyMatchNetConfig, LossConfig
+from kmn_jax.train.examples import ExampleConfig
+from kmn_jax.train.optimizer import OptimizerConfig
+from kmn_jax.train.step import StepConfig
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A training run. `configs/` holds the named ones."""
+
+    name: str
+    pack: str  # folder of the pack
+    num_steps: int
+    network: KeyMatchNetConfig = field(default_factory=KeyMatchNetConfig)
+    examples: ExampleConfig = field(default_factory=ExampleConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    pipeline: PipelineConfig = field(default_factory=PipelineConfig)
+    groups_at_once: int | None = None  # objects that are computed side by side; None: all of a batch
+    average_decay: float = 0.0  # of the running mean of the parameters that is evaluated and shipped; 0: the last ones
+    seed: int = 0
+    validate_every: int = 1000  # steps
+    validation_samples: int = 20  # of each validation object
+    checkpoint_every: int = 500  # steps
+    log_every: int = 20  # steps
+
+    def __post_init__(self) -> None:
+        for name in ("num_steps", "validate_every", "validation_samples", "checkpoint_every", "log_every"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} = {getattr(self, name)} must be at least 1")
+        groups = self.pipeline.groups_per_batch
+        if self.groups_at_once is not None and (self.groups_at_once < 1 or groups % self.groups_at_once):
+            raise InputError(
+                f"groups_at_once = {self.groups_at_once} must divide the {groups} groups of a batch:"
+                f" batch_size = {self.pipeline.batch_size} over crops_per_object = {self.pipeline.crops_per_object}"
+            )
+        if self.examples.crops.num_points != self.network.num_scene_points:
+            raise InputError(
+                f"examples.crops.num_points = {self.examples.crops.num_points} and network.num_scene_points ="
+                f" {self.network.num_scene_points} must be the same"
+            )
+        self.optimizer.build(self.num_steps)  # contradictions between the schedule and the run's length
+
+    @property
+    def step(self) -> StepConfig:
+        """What the step reads."""
+        return StepConfig(
+            network=self.network,
+            examples=self.examples,
+            loss=self.loss,
+            crops_per_object=self.pipeline.crops_per_object,
+            groups_at_once=self.groups_at_once,
+            average_decay=self.average_decay,
+            seed=self.seed,
+        )
