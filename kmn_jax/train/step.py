@@ -147,10 +147,10 @@ def _chunks(index: SampleIndex, key: PRNGKey | None, config: StepConfig) -> _Chu
             f" {config.crops_per_object}"
         )
     shape = (groups // at_once, at_once, config.crops_per_object)
-    drops, counted = index.drop.reshape(shape), index.mask.reshape(shape)
-    keys = index.key.reshape(*shape, 2)
+    rows, drops, counted = (jnp.asarray(array).reshape(shape) for array in (index.object, index.drop, index.mask))
+    keys = jnp.asarray(index.key).reshape(*shape, 2)
     dropout = None if key is None else jax.random.split(key, shape[:2])
-    return _Chunk(index.object.reshape(shape)[..., 0], drops, keys, counted, dropout)
+    return _Chunk(rows[..., 0], drops, keys, counted, dropout)
 
 
 def _chunk_sums(
@@ -175,8 +175,9 @@ def _chunk_sums(
         keys = None if crops_key is None else jax.random.split(crops_key, group.crops.shape[0])
 
         def one(crop, mask, is_object, keypoint, head_key):  # type: ignore[no-untyped-def]
-            logits = network.match(network.encode_scene(crop, group.length, mask), features, mask, head_key)
-            return matching_loss(*logits, is_object, keypoint, mask, config.loss)
+            scene = network.encode_scene(crop, group.length, mask)
+            segmentation, keypoints = network.match(scene, features, mask, head_key)
+            return matching_loss(segmentation, keypoints, is_object, keypoint, mask, config.loss)
 
         return jax.vmap(one)(group.crops, group.mask, group.is_object, group.keypoint, keys)
 
