@@ -6,6 +6,7 @@ electronics  the training pack: 1,507 components of KiCad's public library, as `
              not installed.
 test-sets    7 electronic and 7 industrial objects in 20 bins each, rendered by ray casting, as BOP datasets; their
              digests are compared with those in `assets/test_sets.json`.
+check        what a pack holds: every file against its checksum, every copy against the walls of its bin.
 small        the few objects and images that the repository carries: `assets/small_pack`, `assets/small_test_set`.
 
 A build goes on where it stopped, however it stopped; objects that cannot be used are listed with the reason.
@@ -20,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from jaxtyping import Float
 
 from experiments.kicad import catalogue_sources
 from experiments.test_sets import (
@@ -33,7 +35,9 @@ from experiments.test_sets import (
 )
 from kmn_jax.checks import InputError
 from kmn_jax.data.build import Record, build_pack
+from kmn_jax.data.pack import Pack, PackedObject
 from kmn_jax.data.recipe import PackConfig
+from kmn_jax.data.scene import BinScene
 
 OUTPUTS = Path("outputs")
 SMALL_PACK = (
@@ -82,6 +86,47 @@ class TestSets:
             record_digests(digests)
         for name, digest in digests.items():
             print(f"{self.folder / name}: {digest}: {verdict(name, digest)}")
+
+
+@dataclass(frozen=True)
+class Check:
+    """Check the files of a pack, and that all copies are inside of their bins."""
+
+    folder: Path = OUTPUTS / "packs" / "electronics"
+    tolerance: float = 0.003  # share of the diameter by which a copy may reach into wall or floor
+
+    def run(self) -> None:
+        from tqdm import tqdm
+
+        pack = Pack(self.folder)
+        problems = pack.problems()
+        for problem in problems:
+            print(problem)
+        damaged = sum(any(f"/{name}.safetensors" in problem for problem in problems) for name in pack.names())
+        scenes = copies = outside = 0
+        worst = 0.0
+        for name in tqdm(pack.names(), unit="object"):
+            try:
+                item = pack.load(name, visibility=False)
+            except InputError:
+                continue  # listed above
+            for drop in item.drops:
+                reach = reach_beyond_bin(item, drop.scene) / item.diameter
+                scenes, copies = scenes + 1, copies + len(reach)
+                outside, worst = outside + int((reach > self.tolerance).sum()), max(worst, float(reach.max()))
+        print(
+            f"{len(pack.names())} objects, {damaged} with damaged files; {scenes} scenes, {copies} copies, {outside} of"
+            f" them more than {self.tolerance:.1%} of the diameter into a wall or the floor, the most {worst:.2%}"
+        )
+        if problems or outside:
+            sys.exit(1)
+
+
+def reach_beyond_bin(item: PackedObject, scene: BinScene) -> Float[np.ndarray, " n"]:
+    """Return how far each copy's surfels reach beyond the planes of walls and floor, in metres; below zero: inside."""
+    points = np.einsum("nij,mj->nmi", scene.T_bin_object[:, :3, :3], item.points) + scene.T_bin_object[:, None, :3, 3]
+    sides = np.abs(points[..., :2]) - np.array([scene.bin.length, scene.bin.width]) / 2
+    return np.maximum(sides.max(axis=(1, 2)), -points[..., 2].min(axis=1))
 
 
 @dataclass(frozen=True)
@@ -135,7 +180,9 @@ def print_summary(folder: Path, records: list[Record]) -> None:
 def main() -> None:
     """Run one of the builds."""
     try:
-        tyro.extras.subcommand_cli_from_dict({"electronics": Electronics, "test-sets": TestSets, "small": Small}).run()
+        tyro.extras.subcommand_cli_from_dict(
+            {"electronics": Electronics, "test-sets": TestSets, "check": Check, "small": Small}
+        ).run()
     except InputError as error:
         sys.exit(f"error: {error}")
 

@@ -1,15 +1,17 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from experiments import kicad, test_sets
-from experiments.build_data import SMALL_PACK
+from experiments.build_data import SMALL_PACK, reach_beyond_bin
 from experiments.kicad import catalogue_sources
 from kmn_jax.checks import InputError
 from kmn_jax.data.bop import BopDataset
@@ -106,11 +108,34 @@ def test_small_pack_is_whole_and_of_the_recipe() -> None:
             assert drop.bits is not None
             visible = np.unpackbits(drop.bits, axis=1).mean(axis=1)
             assert 0.05 < visible.mean() < 0.6  # at most about half of a surface faces the camera
-            at = np.einsum("nij,pj->npi", drop.scene.T_bin_object[:, :3, :3], item.points)
-            at = at + drop.scene.T_bin_object[:, None, :3, 3]
-            half = np.array([drop.scene.bin.length, drop.scene.bin.width]) / 2
-            assert (np.abs(at[..., :2]) < half + 0.004 * item.diameter).all()
-            assert at[..., 2].min() > -0.004 * item.diameter
+            assert reach_beyond_bin(item, drop.scene).max() < 0.003 * item.diameter
+
+
+def test_check_counts_copies_outside_and_names_damaged_files(tmp_path: Path) -> None:
+    good = run("experiments.build_data", "check", "--folder", str(ASSETS / "small_pack"))
+    assert good.returncode == 0, good.stderr
+    assert "6 objects, 0 with damaged files; 60 scenes, 660 copies, 0 of them" in good.stdout
+    strict = run("experiments.build_data", "check", "--folder", str(ASSETS / "small_pack"), "--tolerance", "-0.1")
+    assert strict.returncode == 1
+    shutil.copytree(ASSETS / "small_pack", tmp_path / "pack")
+    name = Pack(tmp_path / "pack").names()[0]
+    (tmp_path / "pack" / "objects" / f"{name}.safetensors").write_bytes(b"")
+    damaged = run("experiments.build_data", "check", "--folder", str(tmp_path / "pack"))
+    assert damaged.returncode == 1
+    assert f"{name}.safetensors does not match" in damaged.stdout
+    assert "6 objects, 1 with damaged files; 50 scenes" in damaged.stdout
+
+
+def test_reach_beyond_the_bin_is_that_of_the_farthest_point() -> None:
+    item = Pack(ASSETS / "small_pack").load(SMALL_PACK[0], visibility=False)
+    scene = item.drops[0].scene
+    moved = scene.T_bin_object.copy()
+    before = reach_beyond_bin(item, scene)
+    moved[0, 2, 3] -= 0.5
+    after = reach_beyond_bin(item, replace(scene, T_bin_object=moved))
+    lowest = (item.points @ moved[0, :3, :3].T + moved[0, :3, 3])[:, 2].min()
+    np.testing.assert_allclose(after[0], -lowest, rtol=1e-5)
+    np.testing.assert_array_equal(after[1:], before[1:])
 
 
 @pytest.mark.parametrize("object_id", [1, 2])
