@@ -27,6 +27,7 @@ class TrainConfig:
     groups_at_once: int | None = None  # objects that are computed side by side; None: all of a batch
     average_decay: float = 0.0  # of the running mean of the parameters that is evaluated and shipped; 0: the last ones
     seed: int = 0
+    training_share: float = 1.0  # of the pack's training objects, spread evenly over its list
     validate_every: int = 1000  # steps
     validation_samples: int = 20  # of each validation object
     checkpoint_every: int = 500  # steps
@@ -36,6 +37,17 @@ class TrainConfig:
         for name in ("num_steps", "validate_every", "validation_samples", "checkpoint_every", "log_every"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)} must be at least 1")
+        if not 0 < self.training_share <= 1:
+            raise InputError(f"training_share = {self.training_share} must be above 0 and up to 1")
+        if self.pipeline.epochs is not None:
+            raise InputError(
+                f"pipeline.epochs = {self.pipeline.epochs}, but num_steps says how long a run is: leave it"
+            )
+        if self.validation_samples % self.pipeline.crops_per_object:
+            raise InputError(
+                f"validation_samples = {self.validation_samples} must be a multiple of pipeline.crops_per_object ="
+                f" {self.pipeline.crops_per_object}"
+            )
         groups = self.pipeline.groups_per_batch
         if self.groups_at_once is not None and (self.groups_at_once < 1 or groups % self.groups_at_once):
             raise InputError(

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import nnx
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.device_pack import DevicePack
@@ -47,7 +47,7 @@ class TrainState(NamedTuple):
 
 
 class Metrics(NamedTuple):
-    """Means over the valid crops of a batch, and how many there were."""
+    """Means over the valid crops of a batch, and how many there were; of a training step also what it did."""
 
     loss: Float[Array, ""]
     segmentation_loss: Float[Array, ""]
@@ -55,6 +55,8 @@ class Metrics(NamedTuple):
     segmentation_accuracy: Float[Array, ""]
     keypoint_accuracy: Float[Array, ""]  # over object points of all crops
     num_crops: Float[Array, ""]
+    gradient_norm: Float[Array, ""] | None = None
+    taken: Bool[Array, ""] | None = None  # false if the state was left as it was
 
 
 class Sums(NamedTuple):
@@ -84,8 +86,13 @@ def train_step(
     state: TrainState,
     pack: DevicePack,
     index: SampleIndex,
+    number: Int[Array, ""] | None = None,
 ) -> tuple[TrainState, Metrics]:
-    """Make the examples of a batch, and change the parameters by the gradient of their mean loss."""
+    """Make the examples of a batch, and change the parameters by the gradient of their mean loss.
+
+    If loss or gradient are not finite, the state stays what it was, its step too. With `number`, the step that this is
+    meant to be, it also stays in all later steps: what is kept is the state before the first one that failed.
+    """
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
 
     def summed(parameters: nnx.State, chunk: _Chunk) -> tuple[Float[Array, ""], Sums]:
@@ -105,13 +112,19 @@ def train_step(
         (grads, sums), _ = jax.lax.scan(add, zeros, chunks)
     count = jnp.maximum(sums.num_crops, 1)
     grads = jax.tree.map(lambda leaf: leaf / count, grads)
+    norm = optax.global_norm(grads)
+    taken = jnp.isfinite(sums.loss) & jnp.isfinite(norm)
+    if number is not None:
+        taken &= state.step == number
     updates, moments = optimizer.update(grads, state.optimizer, state.parameters)
     parameters = optax.apply_updates(state.parameters, updates)
     # The running mean starts as a plain one: early parameters should not linger.
-    taken = state.step.astype(jnp.float32) + 1
-    decay = jnp.minimum(config.average_decay, taken / (taken + 10))
+    count = state.step.astype(jnp.float32) + 1
+    decay = jnp.minimum(config.average_decay, count / (count + 10))
     average = jax.tree.map(lambda old, new: decay * old + (1 - decay) * new, state.average, parameters)
-    return TrainState(state.step + 1, parameters, average, moments), mean_metrics(sums)
+    changed = TrainState(state.step + 1, parameters, average, moments)
+    result = jax.tree.map(lambda new, old: jnp.where(taken, new, old), changed, state)
+    return result, mean_metrics(sums)._replace(gradient_norm=norm, taken=taken)
 
 
 def eval_step(
@@ -137,7 +150,10 @@ class _Chunk(NamedTuple):
 
 
 def _chunks(index: SampleIndex, key: PRNGKey | None, config: StepConfig) -> _Chunk:
-    """Split a batch into groups, and those into chunks along a new first axis."""
+    """Split a batch into groups, and those into chunks along a new first axis.
+
+    A chunk takes every n-th group: where devices hold consecutive rows of a batch, each has its share of all chunks.
+    """
     size = index.object.shape[0]
     groups = size // config.crops_per_object
     at_once = config.groups_at_once or groups
@@ -146,10 +162,15 @@ def _chunks(index: SampleIndex, key: PRNGKey | None, config: StepConfig) -> _Chu
             f"a batch of {size} must hold whole chunks of {at_once} groups of crops_per_object ="
             f" {config.crops_per_object}"
         )
-    shape = (groups // at_once, at_once, config.crops_per_object)
-    rows, drops, counted = (jnp.asarray(array).reshape(shape) for array in (index.object, index.drop, index.mask))
-    keys = jnp.asarray(index.key).reshape(*shape, 2)
-    dropout = None if key is None else jax.random.split(key, shape[:2])
+    num_chunks = groups // at_once
+
+    def split(array: Shaped[Array, "b ..."]) -> Shaped[Array, "n c ..."]:
+        return array.reshape(at_once, num_chunks, -1, *array.shape[1:]).swapaxes(0, 1)
+
+    rows, drops, counted, keys = (
+        split(jnp.asarray(array)) for array in (index.object, index.drop, index.mask, index.key)
+    )
+    dropout = None if key is None else split(jax.random.split(key, groups))[:, :, 0]
     return _Chunk(rows[..., 0], drops, keys, counted, dropout)
 
 

@@ -1,0 +1,23 @@
+"""Named training configs, one file for each family. The docstrings there are the records of the runs."""
+
+from __future__ import annotations
+
+import difflib
+
+from configs.base import base
+from configs.debug import debug
+from configs.paper import paper, paper_tenth
+from configs.small import small
+from kmn_jax.checks import InputError
+from kmn_jax.train.config import TrainConfig
+
+CONFIGS: dict[str, TrainConfig] = {config.name: config for config in (paper, paper_tenth, base, small, debug)}
+
+
+def find_config(name: str) -> TrainConfig:
+    """Return the config of a name. Raises InputError with the nearest names if there is none."""
+    if name in CONFIGS:
+        return CONFIGS[name]
+    near = difflib.get_close_matches(name, CONFIGS, n=2)
+    hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(CONFIGS)}"
+    raise InputError(f"there is no config {name!r}: {hint}")

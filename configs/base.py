@@ -1,0 +1,35 @@
+"""The published network with our recipe.
+
+Both clouds are divided by one length, inputs are rotation-invariant, crops of an object share its encoding, one dropout
+mask serves all keypoints; AdamW with warm-up and cosine, bfloat16 layers, and the running mean of the parameters.
+
+base
+    Command:   python -m experiments.train base
+    Hardware:  one GPU of 80 GB or more. Not yet run.
+    Expected:  not yet known.
+"""
+
+from __future__ import annotations
+
+from kmn_jax.data.pipeline import PipelineConfig
+from kmn_jax.models import KeyMatchNetConfig
+from kmn_jax.train.config import TrainConfig
+from kmn_jax.train.optimizer import OptimizerConfig
+
+base = TrainConfig(
+    name="base",
+    pack="outputs/packs/electronics",
+    num_steps=20_000,
+    network=KeyMatchNetConfig(inputs="invariant", dropout=0.1, compute="bfloat16"),
+    optimizer=OptimizerConfig(
+        schedule="cosine",
+        learning_rate=1e-3,
+        least_rate=1e-6,
+        warmup_steps=500,
+        weight_decay=0.02,
+        decoupled=True,
+        clip_norm=1.0,
+    ),
+    pipeline=PipelineConfig(batch_size=128, crops_per_object=4),
+    average_decay=0.999,
+)

@@ -1,0 +1,52 @@
+"""A network that a robot's CPU runs in real time: 512 points, half the widths and less, one neighbour graph.
+
+small
+    Command:   python -m experiments.train small
+    Hardware:  2 CPU cores: about 25 samples/s, of which making the samples takes a quarter. Not yet run.
+    Expected:  not yet known.
+"""
+
+from __future__ import annotations
+
+from kmn_jax.data.crops import CropConfig
+from kmn_jax.data.pipeline import PipelineConfig
+from kmn_jax.models import KeyMatchNetConfig
+from kmn_jax.train.config import TrainConfig
+from kmn_jax.train.examples import ExampleConfig
+from kmn_jax.train.optimizer import OptimizerConfig
+
+small = TrainConfig(
+    name="small",
+    pack="outputs/packs/electronics",
+    num_steps=40_000,
+    network=KeyMatchNetConfig(
+        num_scene_points=512,
+        num_object_points=512,
+        num_neighbors=12,
+        edge_width=32,
+        embedding_width=512,
+        scene_width=256,
+        object_width=64,
+        pair_width=128,
+        groups=16,
+        dropout=0.1,
+        inputs="invariant",
+        graph="static",
+    ),
+    examples=ExampleConfig(crops=CropConfig(num_points=512)),
+    optimizer=OptimizerConfig(
+        schedule="cosine",
+        learning_rate=1e-3,
+        least_rate=1e-5,
+        warmup_steps=500,
+        weight_decay=0.01,
+        decoupled=True,
+        clip_norm=1.0,
+    ),
+    pipeline=PipelineConfig(batch_size=16, crops_per_object=4),
+    average_decay=0.999,
+    validate_every=1_000,
+    validation_samples=20,
+    checkpoint_every=200,
+    log_every=50,
+)

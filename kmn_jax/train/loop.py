@@ -1,0 +1,339 @@
+"""A training run: a folder, from which it can go on to the bit, and the steps between two stops.
+
+The only module of training that acts: it draws batches, dispatches steps, writes files and listens to signals.
+
+A run's folder holds `config.json`; `sessions.jsonl`, with commit, versions and devices; `metrics.jsonl`, the same as
+`metrics.csv` and for TensorBoard in `events/`; `checkpoints/`; `model.safetensors`, the running mean of the parameters
+at the lowest validation loss, and `last.safetensors`, at the last stop.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+from jaxtyping import Array
+
+from kmn_jax.checks import InputError
+from kmn_jax.data.pipeline import BatchIterator, SampleIndex
+from kmn_jax.files import write_whole
+from kmn_jax.models import save_model
+from kmn_jax.train.checkpoint import Checkpoints
+from kmn_jax.train.config import TrainConfig
+from kmn_jax.train.records import MetricFiles, write_config, write_session
+from kmn_jax.train.sharding import (
+    any_process,
+    check_batch,
+    data_mesh,
+    jit_eval_step,
+    jit_train_step,
+    put_batch,
+    put_number,
+    put_whole,
+)
+from kmn_jax.train.snapshot import Snapshot
+from kmn_jax.train.sources import training_source, validation_source
+from kmn_jax.train.step import Metrics, create_state, mean_metrics
+from kmn_jax.train.stop import StopRequest
+from kmn_jax.train.transfer import MANIFEST, export_snapshot, import_snapshot
+from kmn_jax.train.window import MEANS, Window
+
+# What a resumed run may change: how long it is, where its pack lies, and what it writes when.
+_FREE = ("name", "pack", "num_steps", "validate_every", "checkpoint_every", "log_every")
+_AHEAD = 2  # steps that are dispatched before the metrics of one are read
+
+
+class NotFiniteError(RuntimeError):
+    """A loss or gradient was not finite. The message is one sentence for people."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Where a run stands: `reason` says why it stopped before its last step, empty if it did not."""
+
+    step: int
+    reason: str
+    best_loss: float | None  # the lowest validation loss
+    best_step: int
+
+
+class _Pending(NamedTuple):
+    number: int
+    samples: SampleIndex
+    batches: bytes  # the state from which the batch was drawn
+    metrics: Metrics
+    stop: Array | bool
+
+
+def train(
+    config: TrainConfig,
+    folder: str | Path,
+    *,
+    max_minutes: float | None = None,
+    resume: bool = False,
+    import_from: str | Path | None = None,
+    export_to: str | Path | None = None,
+    progress: bool = True,
+    report: Callable[[str], None] | None = None,
+) -> Outcome:
+    """Train, from the beginning or with `resume` from the last checkpoint, until done or told to stop.
+
+    SIGTERM, SIGINT and `max_minutes` stop it between two steps, with everything saved. `import_from` begins with an
+    exported snapshot, in a new folder; `export_to` writes one of where the run stopped. Messages go to `report`, by
+    default to stdout, above the progress bar.
+
+    Raises:
+        InputError: a folder with a run and no `resume`, a config that differs from the run's, data that cannot be
+            used, or batches that devices cannot share.
+        NotFiniteError: a loss or gradient was not finite; state and batch are in the run's folder `nan`.
+    """
+    folder = Path(folder)
+    stop = StopRequest(max_minutes)
+    _prepare(folder, config, resume, import_from)
+    if export_to is not None and (Path(export_to) / MANIFEST).exists():
+        raise InputError(f"{export_to} holds an export already: choose another folder to export to")
+    run = _Run(config, folder, data_mesh(), stop, report or _print)
+    run.restore(import_from)
+    with stop:
+        outcome = run.loop(progress)
+    if export_to is not None and run.first:
+        run.export(Path(export_to))
+    return outcome
+
+
+def _prepare(folder: Path, config: TrainConfig, resume: bool, import_from: str | Path | None) -> None:
+    """Make the folder, and see that it holds this run or none."""
+    exists = (folder / "config.json").exists()
+    if exists and not resume:
+        raise InputError(f"{folder} holds a run: resume it, or choose another folder")
+    if exists and import_from is not None:
+        raise InputError(f"{folder} holds a run already: resume it without importing, or import into another folder")
+    if jax.process_index() == 0:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_config(folder, asdict(config), _FREE)
+
+
+class _Run:
+    def __init__(
+        self, config: TrainConfig, folder: Path, mesh: Mesh, stop: StopRequest, report: Callable[[str], None]
+    ) -> None:
+        self.config, self.folder, self.mesh, self.stop = config, folder, mesh, stop
+        self.first = jax.process_index() == 0
+        self.report = report if self.first else _ignore
+        size = config.pipeline.batch_size
+        check_batch(size, config.step, mesh)
+        self.training, self.validation = training_source(config, mesh), validation_source(config, mesh)
+        for problem in (*self.training.problems, *self.validation.problems):
+            self.report(f"left out: {problem}")
+        optimizer = config.optimizer.build(config.num_steps)
+        self.graphdef, state = create_state(config.step, optimizer)
+        self.state = put_whole(state, mesh)
+        self.train_step = jit_train_step(self.graphdef, optimizer, config.step, mesh)
+        self.eval_step = jit_eval_step(self.graphdef, config.step, mesh)
+        self.rates = np.asarray(jax.jit(jax.vmap(config.optimizer.rate(config.num_steps)))(np.arange(config.num_steps)))
+        self.batches: BatchIterator[SampleIndex] = BatchIterator(self.training.batches, identity=self.training.digest)
+        self.checkpoints = Checkpoints(folder / "checkpoints", report=self.report)
+        self.pending: deque[_Pending] = deque()
+        self.stopped = ""
+        self.step = self.validated = self.best_step = 0
+        self.saved = -1
+        self.best_loss: float | None = None
+        self.seconds_before, self.began = 0.0, time.monotonic()
+        self.window = Window()
+
+    def restore(self, import_from: str | Path | None) -> None:
+        """Go on from an exported snapshot or the last checkpoint, if there is one."""
+        found = self.checkpoints.latest(self.state) if import_from is None else import_snapshot(import_from, self.state)
+        if found is not None:
+            self._take(found)
+            self.report(f"going on at step {self.step} of {self.config.num_steps}")
+        if self.first:
+            facts = {"training_objects": len(self.training.names), "validation_objects": len(self.validation.names)}
+            write_session(self.folder, self.step, facts)
+
+    def loop(self, progress: bool) -> Outcome:
+        """Train until done or stopped."""
+        from tqdm import tqdm
+
+        config, size = self.config, self.config.pipeline.batch_size
+        self.files = MetricFiles(self.folder, self.step) if self.first else None
+        quiet = not (progress and self.first)
+        total, done = config.num_steps * size, self.step * size
+        interval = 1.0 if sys.stderr.isatty() else 30.0
+        with tqdm(total=total, initial=done, unit=" samples", disable=quiet, mininterval=interval) as bar:
+            self.bar = bar
+            self.window = Window(self.window.saved())
+            while not self._at_boundary():
+                self._advance()
+        if self.files is not None:
+            self.files.close()
+            save_model((self.graphdef, self.state.average), self.folder / "last.safetensors")
+        return Outcome(self.step, self.stopped, self.best_loss, self.best_step)
+
+    def export(self, folder: Path) -> None:
+        """Write where the run stands into a few files that another folder can import."""
+        export_snapshot(self._snapshot(), folder)
+
+    def _at_boundary(self) -> bool:
+        """Validate and save if it is time to, and tell whether the run ends here."""
+        config, step = self.config, self.step
+        last = step >= config.num_steps
+        self.stopped = "" if last else self.stopped or self._reason()
+        validate = step > self.validated and (last or step % config.validate_every == 0) and not self.stopped
+        save = bool(self.stopped) or last or step % config.checkpoint_every == 0
+        if not (validate or save):
+            return False
+        self._settle(0)
+        began = time.monotonic()
+        best = validate and self._validate()
+        self.stopped = "" if last else self.stopped or self._reason()
+        if best or ((save or self.stopped) and step != self.saved):
+            self._save(best)
+        self.window.pause(time.monotonic() - began)
+        return last or bool(self.stopped)
+
+    def _reason(self) -> str:
+        # Several processes stop by their common vote, at the same step.
+        return self.stop.reason if jax.process_count() == 1 else ""
+
+    def _advance(self) -> None:
+        state, index = self.batches.get_state(), next(self.batches)
+        with jax.transfer_guard("disallow"):
+            number = put_number(self.step, self.mesh)
+            batch = put_batch(index, self.mesh)
+            self.state, metrics = self.train_step(self.state, self.training.pack, batch, number)
+            vote = any_process(bool(self.stop.reason), self.mesh)
+            for array in jax.tree.leaves(metrics):
+                array.copy_to_host_async()
+        self.pending.append(_Pending(self.step, index, state, metrics, vote))
+        self.step += 1
+        self._settle(_AHEAD)
+
+    def _settle(self, ahead: int) -> None:
+        """Read the metrics of all steps but the last ones."""
+        config, size = self.config, self.config.pipeline.batch_size
+        while len(self.pending) > ahead:
+            done = self.pending.popleft()
+            metrics: Metrics = jax.device_get(done.metrics)
+            if not metrics.taken:
+                self._fail(done, metrics)
+            if jax.process_count() > 1 and bool(jax.device_get(done.stop)):
+                self.stopped = "a process was told to stop"
+            self.window.add(metrics, size)
+            self.bar.update(size)
+            step = done.number + 1
+            if step % config.log_every and step != config.num_steps:
+                continue
+            means = self.window.means()
+            self._write(step, "train", {**means, "learning_rate": float(self.rates[done.number])})
+            self.bar.set_postfix_str(
+                f"loss {means['loss']:.3f}, segmentation {means['segmentation_accuracy']:.3f}, keypoints"
+                f" {means['keypoint_accuracy']:.3f}, rate {self.rates[done.number]:.1e}",
+                refresh=False,
+            )
+            self.window = Window()
+
+    def _validate(self) -> bool:
+        """Validate the running mean of the parameters; tell whether it is the best. A stop breaks it off."""
+        batches, found = self.validation.batches, []
+        for number in range(len(batches)):
+            if self._reason():
+                return False
+            with jax.transfer_guard("disallow"):
+                batch = put_batch(batches[number], self.mesh)
+                found.append(self.eval_step(self.state.average, self.validation.pack, batch))
+            jax.block_until_ready(found[max(0, number - _AHEAD)])
+        # On the host, in order: the same to the bit on any number of devices that gives the same batches.
+        total = jax.tree.map(lambda *parts: jnp.float32(np.sum(parts, dtype=np.float64)), *jax.device_get(found))
+        metrics = mean_metrics(total)
+        means = {name: float(getattr(metrics, name)) for name in MEANS}
+        self._write(self.step, "validation", means)
+        self.validated = self.step
+        best = np.isfinite(means["loss"]) and (self.best_loss is None or means["loss"] < self.best_loss)
+        self.report(
+            f"step {self.step}: validation loss {means['loss']:.4f}, segmentation {means['segmentation_accuracy']:.4f},"
+            f" keypoints {means['keypoint_accuracy']:.4f}{', the best so far' if best else ''}"
+        )
+        if best:
+            self.best_loss, self.best_step = means["loss"], self.step
+        return bool(best)
+
+    def _write(self, step: int, split: str, values: dict[str, float]) -> None:
+        if self.files is not None:
+            seen = step * self.config.pipeline.batch_size
+            self.files.write({"step": step, "samples": seen, "split": split, **values, "seconds": self._seconds()})
+
+    def _seconds(self) -> float:
+        return self.seconds_before + time.monotonic() - self.began
+
+    def _save(self, best: bool) -> None:
+        self.checkpoints.save(self._snapshot(), best=best)
+        self.saved = self.step
+        if best and self.first:
+            save_model((self.graphdef, self.state.average), self.folder / "model.safetensors")
+
+    def _snapshot(self) -> Snapshot:
+        facts = {
+            "step": self.step,
+            "samples": self.step * self.config.pipeline.batch_size,
+            "seconds": self._seconds(),
+            "validated": self.validated,
+            "best_loss": self.best_loss,
+            "best_step": self.best_step,
+            "window": self.window.saved(),
+        }
+        return Snapshot(self.state, self.batches.get_state(), facts)
+
+    def _take(self, found: Snapshot) -> None:
+        facts: dict[str, Any] = found.facts
+        self.batches.set_state(found.batches)
+        self.state = found.state
+        self.step = self.saved = int(facts["step"])
+        self.validated, self.best_step = int(facts["validated"]), int(facts["best_step"])
+        self.best_loss = facts["best_loss"]
+        self.seconds_before, self.began = float(facts["seconds"]), time.monotonic()
+        self.window = Window(facts["window"])
+
+    def _fail(self, done: _Pending, metrics: Metrics) -> None:
+        """Save the state before the step and its batch apart, and raise NotFiniteError."""
+        apart = self.folder / "nan"
+        names = [self.training.names[row] for row in done.samples.object]
+        if self.first:
+            shutil.rmtree(apart, ignore_errors=True)
+            apart.mkdir()
+        self.step = done.number
+        Checkpoints(apart / "checkpoints").save(Snapshot(self.state, done.batches, self._snapshot().facts))
+        samples = [
+            {"object": name, "drop": int(drop), "key": key.tolist()}
+            for name, drop, key in zip(names, done.samples.drop, done.samples.key, strict=True)
+        ]
+        facts = {"step": done.number, "loss": str(metrics.loss), "gradient_norm": str(metrics.gradient_norm)}
+        content = json.dumps({**facts, "samples": samples}, indent=1).encode()
+        write_whole(apart / f"batch{jax.process_index()}.json", content)
+        some = ", ".join(dict.fromkeys(names[: 4 * self.config.pipeline.crops_per_object]))
+        raise NotFiniteError(
+            f"step {done.number}, with the objects {some}, gave loss {metrics.loss} and gradient norm"
+            f" {metrics.gradient_norm}: the state before it and the batch are in {apart}, the last checkpoint is as it"
+            " was; look for the cause there, or import an export of it into another folder with other values"
+        )
+
+
+def _print(message: str) -> None:
+    from tqdm import tqdm
+
+    tqdm.write(message)
+
+
+def _ignore(message: str) -> None:
+    pass

@@ -1,0 +1,134 @@
+"""Which device holds what: one mesh axis, `data`, over which a batch is split; all else is on every device.
+
+No other module knows the mesh. The steps are jitted with these shardings, and XLA adds up the gradients.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import nnx
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Int
+
+from kmn_jax.checks import InputError
+from kmn_jax.data.device_pack import DevicePack
+from kmn_jax.data.pipeline import SampleIndex
+from kmn_jax.train.step import Metrics, StepConfig, Sums, TrainState, eval_step, train_step
+
+TrainStep = Callable[[TrainState, DevicePack, SampleIndex, Int[Array, ""]], tuple[TrainState, Metrics]]
+EvalStep = Callable[[nnx.State, DevicePack, SampleIndex], Sums]
+
+_AXIS = "data"
+_COUNTS = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")  # how many processes srun or mpirun has started
+_KUBERNETES = "JOB_COMPLETION_INDEX"  # set in the pods of an indexed job
+_T = TypeVar("_T")
+
+
+def initialize_distributed(
+    coordinator: str | None = None, processes: int | None = None, process: int | None = None
+) -> None:
+    """Join the run's other processes, if there are any; call it before JAX is used for anything else.
+
+    Without arguments the processes that SLURM, MPI or an indexed job of Kubernetes has started find each other.
+    Otherwise give the first one's host:port as `coordinator`, how many `processes` there are, and which `process` this
+    is. Raises InputError if only some are given or they contradict each other, or if processes cannot be found.
+    """
+    if coordinator is not None and processes is not None and process is not None:
+        if not 0 <= process < processes:
+            raise InputError(f"process = {process} must be from 0 to below processes = {processes}")
+    elif not coordinator and processes is None and process is None:
+        started = any(os.environ.get(name, "1") != "1" for name in _COUNTS)
+        if not started and _KUBERNETES not in os.environ:
+            return
+    else:
+        raise InputError(
+            f"coordinator = {coordinator}, processes = {processes} and process = {process} belong together: give all"
+        )
+    try:
+        jax.distributed.initialize(coordinator, processes, process)
+    except (RuntimeError, ValueError) as error:
+        raise InputError(
+            f"this is one of several processes, but they cannot be joined ({error}): give coordinator, processes and"
+            " process"
+        ) from None
+
+
+def data_mesh(devices: Sequence[jax.Device] | None = None) -> Mesh:
+    """Return the mesh over all devices of all processes, or over those given."""
+    return Mesh(np.array(jax.devices() if devices is None else devices), (_AXIS,))
+
+
+def check_batch(size: int, config: StepConfig, mesh: Mesh) -> None:
+    """Raise InputError unless every device gets whole groups of what is computed side by side."""
+    at_once = config.groups_at_once or size // config.crops_per_object
+    if at_once % mesh.size:
+        raise InputError(
+            f"a batch of {size} in groups of {config.crops_per_object} crops of one object, {at_once} at once, cannot"
+            f" be shared by {mesh.size} devices: choose batch_size and groups_at_once so that they divide"
+        )
+
+
+def jit_train_step(
+    graphdef: nnx.GraphDef, optimizer: optax.GradientTransformation, config: StepConfig, mesh: Mesh
+) -> TrainStep:
+    """Return `train_step` of state, pack, batch and number, compiled for the mesh. The state's memory is reused."""
+    whole, shared = _shardings(mesh)
+    return jax.jit(
+        partial(train_step, graphdef, optimizer, config),
+        in_shardings=(whole, whole, shared, whole),
+        out_shardings=whole,
+        donate_argnums=0,
+    )
+
+
+def jit_eval_step(graphdef: nnx.GraphDef, config: StepConfig, mesh: Mesh) -> EvalStep:
+    """Return `eval_step` of parameters, pack and batch, compiled for the mesh."""
+    whole, shared = _shardings(mesh)
+    step = partial(eval_step, graphdef, config)
+    return jax.jit(step, in_shardings=(whole, whole, shared), out_shardings=whole)
+
+
+def put_whole(tree: _T, mesh: Mesh) -> _T:
+    """Put arrays, the same in all processes, on every device."""
+    return _put(tree, _shardings(mesh)[0])
+
+
+def put_number(value: int, mesh: Mesh) -> Int[Array, ""]:
+    """Put a whole number on every device."""
+    return jnp.asarray(_put(np.asarray(value, np.int32), _shardings(mesh)[0]))
+
+
+def put_batch(index: SampleIndex, mesh: Mesh) -> SampleIndex:
+    """Spread a batch over the devices. Every process gives its own share."""
+    return _put(index, _shardings(mesh)[1])
+
+
+def any_process(flag: bool, mesh: Mesh) -> Array | bool:
+    """Return whether any process says so, as an array that need not be waited for. All must ask alike."""
+    if jax.process_count() == 1:
+        return flag
+    whole, shared = _shardings(mesh)
+    return _any(_put(np.full(mesh.local_mesh.size, flag), shared), whole)
+
+
+def _shardings(mesh: Mesh) -> tuple[NamedSharding, NamedSharding]:
+    return NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(_AXIS))
+
+
+def _put(tree: _T, sharding: NamedSharding) -> _T:
+    if jax.process_count() == 1:
+        return jax.device_put(tree, sharding)
+    return jax.tree.map(lambda array: jax.make_array_from_process_local_data(sharding, np.asarray(array)), tree)
+
+
+@partial(jax.jit, static_argnums=1)
+def _any(flags: Array, sharding: NamedSharding) -> Array:
+    return jax.lax.with_sharding_constraint(flags.any(), sharding)

@@ -1,0 +1,61 @@
+"""The data of a run: the training and validation objects of a pack, on the devices, and the order of their samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from kmn_jax.data.device_pack import DevicePack, StackedPack, stack_pack
+from kmn_jax.data.pack import Pack
+from kmn_jax.data.pipeline import PipelineConfig, SampleBatches
+from kmn_jax.train.config import TrainConfig
+from kmn_jax.train.sharding import put_whole
+
+_VALIDATION_SEED = 0  # of the samples, so that runs of all seeds are validated on the same
+
+
+@dataclass(frozen=True)
+class Source:
+    """Objects of a pack and batches of their samples, of which each process has its share."""
+
+    pack: DevicePack
+    names: tuple[str, ...]
+    digest: str
+    batches: SampleBatches
+    problems: tuple[str, ...]
+
+
+def training_source(config: TrainConfig, mesh: Mesh) -> Source:
+    """Return the training objects, or the configured share of them, and their endless samples."""
+    pack = Pack(config.pack)
+    names = pack.names("train")
+    count = max(1, round(config.training_share * len(names)))
+    chosen = [names[row * len(names) // count] for row in range(min(count, len(names)))]
+    stacked = stack_pack(pack, chosen if names else "train", _with_bits(config))
+    return _source(stacked, config.pipeline, mesh, ordered=False)
+
+
+def validation_source(config: TrainConfig, mesh: Mesh) -> Source:
+    """Return the validation objects and their fixed samples, in order, as one pass."""
+    stacked = stack_pack(Pack(config.pack), "validation", _with_bits(config))
+    pipeline = replace(config.pipeline, samples_per_object=config.validation_samples, seed=_VALIDATION_SEED)
+    return _source(stacked, pipeline, mesh, ordered=True)
+
+
+def _with_bits(config: TrainConfig) -> bool:
+    return config.examples.visibility == "bits"
+
+
+def _source(stacked: StackedPack, pipeline: PipelineConfig, mesh: Mesh, ordered: bool) -> Source:
+    batches = SampleBatches(
+        pipeline,
+        len(stacked.names),
+        np.asarray(stacked.arrays.num_drops),
+        shard_index=jax.process_index(),
+        shard_count=jax.process_count(),
+        ordered=ordered,
+    )
+    return Source(put_whole(stacked.arrays, mesh), stacked.names, stacked.digest, batches, stacked.problems)
