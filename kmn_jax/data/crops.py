@@ -25,7 +25,7 @@ class CropConfig:
 
     Normals are those of the CAD "surface", or "estimated" from noisy points as by a sensor, which has more points than
     a crop keeps: `normal_points` are drawn, those within `normal_radius` define a plane, and the first `num_points` are
-    the crop. (Of the crop's own points, 16 neighbours among 512, half the normals would be off by 20 degrees or more.)
+    the crop. (By the 16 nearest of a crop's own 512 points, the median normal would be off by about 20 degrees.)
     """
 
     num_points: int = 2048
