@@ -32,7 +32,7 @@ class Checkpoints:
     """The latest snapshots of a run and the best one, in a folder of their own.
 
     A process that is killed at any moment leaves the snapshots that were there. Each carries SHA-256 digests of its
-    files and of its content, which are checked when it is read: a damaged one is reported, and the one before is used.
+    files and of its arrays, which are checked when it is read: a damaged one is reported, and the one before is used.
 
     If a run has several processes, all call the same methods at the same steps, and the first one alone reads and
     writes the folder.
@@ -72,7 +72,7 @@ class Checkpoints:
         shardings, of other devices than it was saved from.
 
         Raises:
-            InputError: it is whole, but of another network or optimizer than `like`.
+            InputError: it is whole, but of another network or optimizer than `like`, or of another version of kmn_jax.
         """
         return self._restored(like, best=False)
 
@@ -91,15 +91,14 @@ class Checkpoints:
             if best and not entry.best:
                 continue
             try:
-                packed = _read(entry.path)
-            except MemoryError:
-                raise
-            except Exception as error:  # whatever JSON, orbax and its formats make of damaged files
+                record = _checked_record(entry.path)
+            except Exception as error:  # whatever damage leads to
                 self._damaged.add(entry.path.name)
                 reason = str(error).strip().partition("\n")[0][:300] or type(error).__name__
                 self._report(f"{entry.path} is damaged and is not used: {reason}")
                 continue
             try:
+                packed = _read(entry.path, record)
                 check_fit(packed, like)
             except InputError as error:
                 raise InputError(f"{entry.path}: {error}") from None
@@ -177,25 +176,34 @@ def _save(path: Path, packed: Packed) -> None:
     with _checkpointer() as checkpointer:
         checkpointer.save(staging / _STATE, args=ocp.args.PyTreeSave(arrays))
     files = {str(file.relative_to(staging)): _sha256(file) for file in sorted(staging.rglob("*")) if file.is_file()}
-    record = {"record": packed.record(), "files": files}
-    (staging / _RECORD).write_text(json.dumps(record), encoding="utf-8")
+    content = json.dumps({"record": packed.record(), "files": files})
+    stored = {"sha256": hashlib.sha256(content.encode()).hexdigest(), "content": content}
+    (staging / _RECORD).write_text(json.dumps(stored), encoding="utf-8")
     staging.rename(path)
 
 
-def _read(path: Path) -> Packed:
-    import orbax.checkpoint as ocp
-
+def _checked_record(path: Path) -> dict[str, Any]:
+    """Return the record of a checkpoint, all of whose files are as they were written; else raise any error."""
     stored = json.loads((path / _RECORD).read_text(encoding="utf-8"))
-    # First the files: orbax and its formats do not expect damage, and do not always end well with it.
-    for name, digest in stored["files"].items():
+    if hashlib.sha256(stored["content"].encode()).hexdigest() != stored["sha256"]:
+        raise InputError(f"{_RECORD} is not what was written: its SHA-256 differs")
+    content = json.loads(stored["content"])
+    for name, digest in content["files"].items():
         if _sha256(path / name) != digest:
             raise InputError(f"{name} is not what was written: its SHA-256 differs")
-    layout = read_layout(stored["record"])
+    record: dict[str, Any] = content["record"]
+    return record
+
+
+def _read(path: Path, record: dict[str, Any]) -> Packed:
+    import orbax.checkpoint as ocp
+
+    layout = read_layout(record)
     arrays = {name: np.zeros(shape, dtype) for name, (dtype, shape) in layout.items() if 0 in shape}
     wanted = {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in layout if name not in arrays}
     with _checkpointer() as checkpointer:
         arrays |= checkpointer.restore(path / _STATE, args=ocp.args.PyTreeRestore(restore_args=wanted))
-    return join(stored["record"], arrays)
+    return join(record, arrays)
 
 
 def _checkpointer() -> Any:

@@ -143,24 +143,27 @@ def as_bytes(array: np.ndarray) -> np.ndarray:
 
 
 def from_first_process(make: Callable[[], Packed | None]) -> Packed | None:
-    """Return on all processes what `make` returns on the first, or raise the InputError that it raises there.
+    """Return on all processes what `make` returns on the first, or raise what it raises there, elsewhere as InputError.
 
     All processes must call this; only the first calls `make`.
     """
     packed: Packed | None = None
+    own_error: Exception | None = None
     header: dict[str, Any] = {"problem": None, "record": None}
     if jax.process_index() == 0:
         try:
             packed = make()
             header["record"] = None if packed is None or jax.process_count() == 1 else packed.record()
-        except InputError as error:
-            header["problem"] = str(error)
+        except Exception as error:  # the others wait to hear of it
+            own_error, header["problem"] = error, str(error)
     if jax.process_count() > 1:
         header = json.loads(_broadcast(json.dumps(header).encode()))
         if header["record"] is not None:
             layout = read_layout(header["record"])
             own = b"".join(as_bytes(packed.arrays[name]).tobytes() for name in layout) if packed else b""
             packed = join(header["record"], _split(_broadcast(own), layout))
+    if own_error is not None:
+        raise own_error
     if header["problem"] is not None:
         raise InputError(header["problem"])
     return packed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import jax
@@ -29,6 +30,7 @@ TINY = KeyMatchNetConfig(
 )
 
 
+@cache
 def abstract_state(network: KeyMatchNetConfig = TINY, clip_norm: float = 1.0) -> TrainState:
     """Return the shapes of a state, without making one."""
     optimizer = OptimizerConfig(clip_norm=clip_norm).build(10_000)
