@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -12,8 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.data.device_pack import stack_pack, take_scene, visible_points
-from kmn_jax.data.pack import Pack
 from kmn_jax.data.raycast import RayMesh, pack_bits, render, visible_bin_surfels, visible_surfels
 from kmn_jax.data.scene import Bin, BinScene, Camera
 from kmn_jax.data.splat import (
@@ -31,7 +28,6 @@ from kmn_jax.data.splat import (
 from kmn_jax.data.surface import outer_surface
 from tests.reference.meshes import box, bracket, camera_scene, pile, pose, random_rotations, sphere, square
 
-SMALL_PACK = Path(__file__).parents[2] / "experiments" / "assets" / "small_pack"
 C = 20  # of copies, so that few programs are compiled
 WIDE = Camera(fx=900.0, fy=880.0, cx=399.5, cy=299.5, width=800, height=600)
 M = 4096
@@ -315,26 +311,6 @@ def test_splatting_agrees_with_ray_casting(name: str, record_property: Callable[
     record_property("missed", f"{result.missed:.2%}")
     assert result.false <= 0.03
     assert result.missed <= 0.10
-
-
-def test_splatting_agrees_with_the_bits_of_sixty_settled_bins(record_property: Callable[[str, object], None]) -> None:
-    pack = stack_pack(Pack(SMALL_PACK), Pack(SMALL_PACK).names()).arrays
-    config = SplatConfig(num_bin_surfels=8 * pack.bin_bits.shape[-1])
-
-    def both(place: jax.Array) -> jax.Array:
-        scene = take_scene(pack, place[0], place[1])
-        return jnp.stack([visible_points(scene, config).mask, visible_points(scene).mask])
-
-    places = jnp.array([[i, j] for i in range(len(pack.area)) for j in range(pack.num_drops[i])], dtype=jnp.int32)
-    found, truth = np.moveaxis(np.asarray(jax.jit(lambda places: jax.lax.map(both, places))(places)), 1, 0)
-    assert len(places) == 60
-    on_bin = config.num_bin_surfels
-    for name, rows in (("objects", np.s_[:, :-on_bin]), ("bin", np.s_[:, -on_bin:])):
-        result = agreement(found[rows], truth[rows])
-        record_property(f"{name}: false", f"{result.false:.2%}")
-        record_property(f"{name}: missed", f"{result.missed:.2%}")
-        assert result.false <= 0.03
-        assert result.missed <= 0.10
 
 
 def test_points_outside_the_image_or_behind_the_camera_are_not_visible() -> None:
