@@ -59,11 +59,19 @@ class Electronics:
     models: Path | None = None  # folder with KiCad's 3D models; without it, the Debian package is fetched
     limit: int | None = None  # build only so many, spread over the splits
     workers: int | None = None  # processes; all cores unless given
+    retry_rejected: bool = False  # try again what an earlier run rejected
     pack: PackConfig = field(default_factory=PackConfig)
 
     def run(self) -> None:
         sources, licence = catalogue_sources(self.models, OUTPUTS / "kicad", self.limit)
-        records = build_pack(self.folder, sources, self.pack, workers=self.workers, licence=licence)
+        records = build_pack(
+            self.folder,
+            sources,
+            self.pack,
+            workers=self.workers,
+            retry_rejected=self.retry_rejected,
+            licence=licence,
+        )
         print_summary(self.folder, records)
 
 

@@ -52,12 +52,13 @@ def build_pack(
     *,
     workers: int | None = None,
     minutes_per_object: float = 5.0,
+    retry_rejected: bool = False,
     **manifest_facts: Any,
 ) -> list[Record]:
     """Build a pack in `folder`, or go on with one, and write its manifest; return what became of each source.
 
-    Objects that the journal lists are not made again. A file that is broken, takes too long or crashes its process is
-    rejected, with the reason, and the others go on. Raises InputError if the folder holds a pack of another recipe.
+    Objects that the journal lists are not made again, but with `retry_rejected` those that were rejected. A file that
+    is broken, takes too long or crashes its process is rejected, with the reason, and the others go on. Raises InputError if the folder holds a pack of another recipe.
     """
     from tqdm import tqdm
 
@@ -67,7 +68,8 @@ def build_pack(
     wanted = {source.name: source for source in sources}
     if len(wanted) != len(sources):
         raise InputError(f"{len(sources) - len(wanted)} sources have the name of another: names must differ")
-    left = [source for source in sources if source.name not in journal.records]
+    done = {name for name, record in journal.records.items() if not (record.reason and retry_rejected)}
+    left = [source for source in sources if source.name not in done]
     bar = tqdm(total=len(sources), initial=len(sources) - len(left), unit="object", mininterval=1, smoothing=0.05)
     for record in _made(folder, left, config, workers or os.cpu_count() or 1, minutes_per_object * 60):
         journal.add(record)

@@ -103,18 +103,19 @@ def _parse(content: bytes, suffix: str) -> _Parsed:
     if suffix in (".xyz", ".xyzn"):
         return *parse_xyz(content, with_normals=suffix == ".xyzn"), none
     if suffix == ".glb":
-        return _parse_glb(content, merge=False)
-    return _parse_glb(step_to_glb(content), merge=True)
+        return _parse_glb(content)
+    return _parse_glb(step_to_glb(content))
 
 
-def _parse_glb(content: bytes, merge: bool) -> _Parsed:
+def _parse_glb(content: bytes) -> _Parsed:
     if content[:4] != b"glTF" or int.from_bytes(content[8:12], "little") != len(content):
         raise InputError("it is truncated, or not a GLB file")
     import trimesh
 
     try:
         with _quiet("trimesh"):
-            scene = trimesh.load_scene(io.BytesIO(content), file_type="glb", process=False, merge_primitives=merge)
+            # Merged, primitives of which only some have a material make the reader fail.
+            scene = trimesh.load_scene(io.BytesIO(content), file_type="glb", process=False, merge_primitives=False)
             parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
             vertices = [np.asarray(part.vertices, dtype=np.float64) for part in parts]
             starts = np.cumsum([0] + [len(part) for part in vertices])

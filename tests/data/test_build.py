@@ -89,6 +89,13 @@ def test_builds_what_it_can_names_the_rest_and_goes_on_where_it_stopped(
     assert Pack(folder).names() == ["box0", "box1", "box2"]
     assert {name: (folder / name).stat().st_mtime_ns for name in before} == before
 
+    # What was rejected is tried again only when that is asked for.
+    broken.write_bytes(good[0].path.read_bytes())
+    mended = {r.name: r.reason for r in build_pack(folder, sources[:3], CONFIG, workers=1, retry_rejected=True)}
+    assert mended["broken"] is None
+    assert "missing.stl cannot be read" in str(mended["missing"])
+    assert Pack(folder).names() == ["box0", "broken"]
+
     with pytest.raises(InputError, match="records a build by another recipe"):
         build_pack(folder, sources, PackConfig(surfels=256, drops=2, copies=(1, 2)))
 

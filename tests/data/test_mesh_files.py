@@ -1,3 +1,4 @@
+import json
 import struct
 
 import numpy as np
@@ -153,3 +154,37 @@ def test_units_are_explicit(tmp_path, valid):
         with pytest.raises(InputError, match="use one of m, cm, mm, in"):
             read_mesh(tmp_path / "a.stl", wrong)
     assert check_unit("cm") == "cm"
+
+
+def two_primitives_glb():
+    """Return a mesh of two triangles, of which only the first has a material."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1]], "<f4")
+    data = points.tobytes() + np.array([0, 1, 2, 0, 1, 2], "<u4").tobytes()
+    views = [{"buffer": 0, "byteOffset": start, "byteLength": size} for start, size in ((0, 36), (36, 36), (72, 12))]
+    vectors = {"componentType": 5126, "count": 3, "type": "VEC3"}
+    accessors = [{**vectors, "bufferView": view, "min": [0, 0, 0], "max": [1, 1, 1]} for view in (0, 1)]
+    accessors.append({"bufferView": 2, "componentType": 5125, "count": 3, "type": "SCALAR"})
+    primitives = [{"attributes": {"POSITION": part}, "indices": 2} for part in (0, 1)]
+    primitives[0]["material"] = 0
+    document = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": primitives}],
+        "materials": [{"pbrMetallicRoughness": {"baseColorFactor": [1, 0, 0, 1]}}],
+        "buffers": [{"byteLength": len(data)}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    head = json.dumps(document).encode()
+    head += b" " * (-len(head) % 4)
+    total = 12 + 8 + len(head) + 8 + len(data)
+    chunks = struct.pack("<I4s", len(head), b"JSON") + head + struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, total) + chunks, points.reshape(2, 3, 3)
+
+
+def test_glb_whose_primitives_have_different_materials(tmp_path):
+    content, triangles = two_primitives_glb()
+    found = corners(read_mesh(written(tmp_path, "part.glb", content)))
+    np.testing.assert_array_equal(found[np.argsort(found[:, 0, 2])], triangles)
