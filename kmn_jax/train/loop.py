@@ -15,6 +15,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,7 +32,7 @@ from kmn_jax.files import write_whole
 from kmn_jax.models import save_model
 from kmn_jax.train.checkpoint import Checkpoints
 from kmn_jax.train.config import TrainConfig
-from kmn_jax.train.records import MetricFiles, write_config, write_session
+from kmn_jax.train.records import MetricFiles, check_config, write_config, write_session
 from kmn_jax.train.sharding import (
     any_process,
     check_batch,
@@ -42,15 +43,16 @@ from kmn_jax.train.sharding import (
     put_number,
     put_whole,
 )
-from kmn_jax.train.snapshot import Snapshot
+from kmn_jax.train.snapshot import Snapshot, from_first_process
 from kmn_jax.train.sources import training_source, validation_source
 from kmn_jax.train.step import Metrics, create_state, mean_metrics
 from kmn_jax.train.stop import StopRequest
-from kmn_jax.train.transfer import MANIFEST, export_snapshot, import_snapshot
+from kmn_jax.train.transfer import FILE_LIMIT, MANIFEST, export_snapshot, import_snapshot
 from kmn_jax.train.window import MEANS, Window
 
 # What a resumed run may change: how long it is, where its pack lies, and what it writes when.
 _FREE = ("name", "pack", "num_steps", "validate_every", "checkpoint_every", "log_every")
+_CARRIED = ("metrics.jsonl", "sessions.jsonl", "model.safetensors")  # go with an export
 _AHEAD = 2  # steps that are dispatched before the metrics of one are read
 
 
@@ -100,9 +102,8 @@ def train(
     """
     folder = Path(folder)
     stop = StopRequest(max_minutes)
-    _prepare(folder, config, resume, import_from)
-    if export_to is not None and (Path(export_to) / MANIFEST).exists():
-        raise InputError(f"{export_to} holds an export already: choose another folder to export to")
+    # By one process, or the others might find what it has just written.
+    from_first_process(lambda: _check(folder, config, resume, import_from, export_to))
     run = _Run(config, folder, data_mesh(), stop, report or _print)
     run.restore(import_from)
     with stop:
@@ -112,16 +113,19 @@ def train(
     return outcome
 
 
-def _prepare(folder: Path, config: TrainConfig, resume: bool, import_from: str | Path | None) -> None:
-    """Make the folder, and see that it holds this run or none."""
+def _check(
+    folder: Path, config: TrainConfig, resume: bool, import_from: str | Path | None, export_to: str | Path | None
+) -> None:
+    """See that the folder holds this run or none, before anything takes time."""
     exists = (folder / "config.json").exists()
-    if exists and not resume:
-        raise InputError(f"{folder} holds a run: resume it, or choose another folder")
     if exists and import_from is not None:
         raise InputError(f"{folder} holds a run already: resume it without importing, or import into another folder")
-    if jax.process_index() == 0:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_config(folder, asdict(config), _FREE)
+    if exists and not resume:
+        raise InputError(f"{folder} holds a run: resume it, or choose another folder")
+    if export_to is not None and (Path(export_to) / MANIFEST).exists():
+        raise InputError(f"{export_to} holds an export already: choose another folder to export to")
+    if exists:
+        check_config(folder, asdict(config), _FREE)
 
 
 class _Run:
@@ -136,12 +140,12 @@ class _Run:
         self.training, self.validation = training_source(config, mesh), validation_source(config, mesh)
         for problem in (*self.training.problems, *self.validation.problems):
             self.report(f"left out: {problem}")
-        optimizer = config.optimizer.build(config.num_steps)
-        self.graphdef, state = create_state(config.step, optimizer)
+        optimizer, num_steps = config.optimizer, config.num_steps
+        self.graphdef, state = create_state(config.step, optimizer.build(num_steps))
         self.state = put_whole(state, mesh)
-        self.train_step = jit_train_step(self.graphdef, optimizer, config.step, mesh)
+        self.train_step = jit_train_step(self.graphdef, optimizer, num_steps, config.step, mesh)
         self.eval_step = jit_eval_step(self.graphdef, config.step, mesh)
-        self.rates = np.asarray(jax.jit(jax.vmap(config.optimizer.rate(config.num_steps)))(np.arange(config.num_steps)))
+        self.rates = optimizer.rates(num_steps)
         self.batches: BatchIterator[SampleIndex] = BatchIterator(self.training.batches, identity=self.training.digest)
         self.checkpoints = Checkpoints(folder / "checkpoints", report=self.report)
         self.pending: deque[_Pending] = deque()
@@ -155,10 +159,18 @@ class _Run:
     def restore(self, import_from: str | Path | None) -> None:
         """Go on from an exported snapshot or the last checkpoint, if there is one."""
         found = self.checkpoints.latest(self.state) if import_from is None else import_snapshot(import_from, self.state)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot make the folder {self.folder}: {error.strerror}") from None
         if found is not None:
             self._take(found)
             self.report(f"going on at step {self.step} of {self.config.num_steps}")
         if self.first:
+            for name in _CARRIED if import_from is not None else ():
+                if (Path(import_from or "") / name).exists():
+                    shutil.copyfile(Path(import_from or "") / name, self.folder / name)
+            write_config(self.folder, asdict(self.config))
             facts = {"training_objects": len(self.training.names), "validation_objects": len(self.validation.names)}
             write_session(self.folder, self.step, facts)
 
@@ -167,23 +179,30 @@ class _Run:
         from tqdm import tqdm
 
         config, size = self.config, self.config.pipeline.batch_size
-        self.files = MetricFiles(self.folder, self.step) if self.first else None
         quiet = not (progress and self.first)
         total, done = config.num_steps * size, self.step * size
         interval = 1.0 if sys.stderr.isatty() else 30.0
-        with tqdm(total=total, initial=done, unit=" samples", disable=quiet, mininterval=interval) as bar:
-            self.bar = bar
+        with ExitStack() as stack:
+            self.files = stack.enter_context(MetricFiles(self.folder, self.step)) if self.first else None
+            self.bar = tqdm(total=total, initial=done, unit=" samples", disable=quiet, mininterval=interval)
+            stack.enter_context(self.bar)
             self.window = Window(self.window.saved())
             while not self._at_boundary():
                 self._advance()
-        if self.files is not None:
-            self.files.close()
+        if self.first:
             save_model((self.graphdef, self.state.average), self.folder / "last.safetensors")
         return Outcome(self.step, self.stopped, self.best_loss, self.best_step)
 
     def export(self, folder: Path) -> None:
         """Write where the run stands into a few files that another folder can import."""
-        export_snapshot(self._snapshot(), folder)
+        paths = export_snapshot(self._snapshot(), folder)
+        for name in _CARRIED:
+            path = self.folder / name
+            if path.exists() and path.stat().st_size < FILE_LIMIT:
+                shutil.copyfile(path, folder / name)
+            elif path.exists():
+                self.report(f"{path} stays behind: it has {path.stat().st_size} bytes")
+        self.report(f"exported step {self.step} to {folder}, {len(paths)} files of state")
 
     def _at_boundary(self) -> bool:
         """Validate and save if it is time to, and tell whether the run ends here."""
@@ -229,7 +248,7 @@ class _Run:
             if not metrics.taken:
                 self._fail(done, metrics)
             if jax.process_count() > 1 and bool(jax.device_get(done.stop)):
-                self.stopped = "a process was told to stop"
+                self.stopped = self.stop.reason or "another process was told to stop"
             self.window.add(metrics, size)
             self.bar.update(size)
             step = done.number + 1
@@ -254,7 +273,6 @@ class _Run:
                 batch = put_batch(batches[number], self.mesh)
                 found.append(self.eval_step(self.state.average, self.validation.pack, batch))
             jax.block_until_ready(found[max(0, number - _AHEAD)])
-        # On the host, in order: the same to the bit on any number of devices that gives the same batches.
         total = jax.tree.map(lambda *parts: jnp.float32(np.sum(parts, dtype=np.float64)), *jax.device_get(found))
         metrics = mean_metrics(total)
         means = {name: float(getattr(metrics, name)) for name in MEANS}
@@ -311,7 +329,6 @@ class _Run:
         names = [self.training.names[row] for row in done.samples.object]
         if self.first:
             shutil.rmtree(apart, ignore_errors=True)
-            apart.mkdir()
         self.step = done.number
         Checkpoints(apart / "checkpoints").save(Snapshot(self.state, done.batches, self._snapshot().facts))
         samples = [

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
+import jax
+import numpy as np
 import optax
+from jaxtyping import Float32
 
 from kmn_jax.checks import InputError
 
@@ -68,11 +71,25 @@ class OptimizerConfig:
             self.least_rate,
         )
 
+    def rates(self, num_steps: int) -> Float32[np.ndarray, " steps"]:
+        """Return the learning rate of every step of a run, on the host."""
+        with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+            return np.asarray(jax.jit(jax.vmap(self.rate(num_steps)))(np.arange(num_steps)), np.float32)
+
     def build(self, num_steps: int) -> optax.GradientTransformation:
         """Return the optimizer of a run of so many steps."""
         rate = self.rate(num_steps)
         clip = [optax.clip_by_global_norm(self.clip_norm)] if self.clip_norm else []
         if self.decoupled:
-            return optax.chain(*clip, optax.adamw(rate, b2=self.beta2, weight_decay=self.weight_decay))
-        decay = [optax.add_decayed_weights(self.weight_decay)] if self.weight_decay else []
-        return optax.chain(*clip, *decay, optax.adam(rate, b2=self.beta2))
+            adam = [optax.adamw(rate, b2=self.beta2, weight_decay=self.weight_decay)]
+        else:
+            decay = [optax.add_decayed_weights(self.weight_decay)] if self.weight_decay else []
+            adam = [*decay, optax.adam(rate, b2=self.beta2)]
+        chain = optax.chain(*clip, *adam)
+
+        def update(grads: Any, state: Any, parameters: Any = None) -> Any:
+            # optax itself mixes dtypes and ranks, also where JAX is told to refuse that.
+            with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+                return chain.update(grads, state, parameters)
+
+        return optax.GradientTransformation(chain.init, update)

@@ -13,6 +13,7 @@ import time
 from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import jax
@@ -60,8 +61,12 @@ class MetricFiles:
         values = {f"{row['split']}/{name}": value for name, value in row.items() if isinstance(value, float)}
         self._events.scalars(int(row["step"]), values)
 
-    def close(self) -> None:
-        """Close the event file."""
+    def __enter__(self) -> MetricFiles:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._events.close()
 
 
@@ -81,25 +86,26 @@ def read_metrics(folder: str | Path) -> list[dict[str, Any]]:
     return rows
 
 
-def write_config(folder: Path, config: Mapping[str, Any], free: tuple[str, ...] = ()) -> None:
-    """Write the resolved config, or compare it with the one that is there.
+def write_config(folder: Path, config: Mapping[str, Any]) -> None:
+    """Write `config.json`."""
+    write_whole(folder / "config.json", json.dumps(config, indent=1).encode() + b"\n")
 
-    Raises InputError if they differ in more than the `free` names. Dots join the names of nested values.
+
+def check_config(folder: Path, config: Mapping[str, Any], free: tuple[str, ...] = ()) -> None:
+    """Raise InputError if `config.json` is broken or differs in more than the `free` names.
+
+    Dots join the names of nested values.
     """
     path = folder / "config.json"
-    if path.exists():
-        try:
-            old = _flat(json.loads(path.read_text(encoding="utf-8")))
-        except ValueError as error:
-            raise InputError(f"{path} is broken ({error}): restore it, or start in another folder") from None
-        new = _flat(json.loads(json.dumps(config)))
-        changed = [name for name in sorted({*old, *new}) if old.get(name) != new.get(name) and name not in free]
-        if changed:
-            what = ", ".join(f"{name} = {old.get(name)}, now {new.get(name)}" for name in changed[:4])
-            raise InputError(
-                f"{folder} holds a run with {what}: resume with the same values, or start in another folder"
-            )
-    write_whole(path, json.dumps(config, indent=1).encode() + b"\n")
+    try:
+        old = _flat(json.loads(path.read_text(encoding="utf-8")))
+    except (AttributeError, ValueError) as error:
+        raise InputError(f"{path} is broken ({error}): restore it, or choose another folder") from None
+    new = _flat(json.loads(json.dumps(config)))
+    changed = [name for name in sorted({*old, *new}) if old.get(name) != new.get(name) and name not in free]
+    if changed:
+        what = ", ".join(f"{name} = {old.get(name)}, not {new.get(name)}" for name in changed[:4])
+        raise InputError(f"{folder} holds a run with {what}: resume with the same values, or choose another folder")
 
 
 def write_session(folder: Path, step: int, facts: Mapping[str, Any]) -> None:

@@ -1,19 +1,20 @@
 """Which device holds what: one mesh axis, `data`, over which a batch is split; all else is on every device.
 
-No other module knows the mesh. The steps are jitted with these shardings, and XLA adds up the gradients.
+No other module knows the mesh. Each device makes and computes its own groups of a batch; all that they exchange is the
+sum of the gradients. (Left to the shardings of jit alone, XLA also gathers scenes and logits from all devices.)
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from functools import partial
-from typing import TypeVar
+from dataclasses import replace
+from functools import lru_cache, partial
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from flax import nnx
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
@@ -21,12 +22,14 @@ from jaxtyping import Array, Int
 from kmn_jax.checks import InputError
 from kmn_jax.data.device_pack import DevicePack
 from kmn_jax.data.pipeline import SampleIndex
-from kmn_jax.train.step import Metrics, StepConfig, Sums, TrainState, eval_step, train_step
+from kmn_jax.train.optimizer import OptimizerConfig
+from kmn_jax.train.step import Metrics, StepConfig, SumGradients, Sums, TrainState, eval_step, train_step
 
 TrainStep = Callable[[TrainState, DevicePack, SampleIndex, Int[Array, ""]], tuple[TrainState, Metrics]]
 EvalStep = Callable[[nnx.State, DevicePack, SampleIndex], Sums]
 
 _AXIS = "data"
+_WHOLE, _SHARED = PartitionSpec(), PartitionSpec(_AXIS)
 _COUNTS = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")  # how many processes srun or mpirun has started
 _KUBERNETES = "JOB_COMPLETION_INDEX"  # set in the pods of an indexed job
 _T = TypeVar("_T")
@@ -76,24 +79,44 @@ def check_batch(size: int, config: StepConfig, mesh: Mesh) -> None:
         )
 
 
+@lru_cache(maxsize=4)
 def jit_train_step(
-    graphdef: nnx.GraphDef, optimizer: optax.GradientTransformation, config: StepConfig, mesh: Mesh
+    graphdef: nnx.GraphDef, optimizer: OptimizerConfig, num_steps: int, config: StepConfig, mesh: Mesh
 ) -> TrainStep:
     """Return `train_step` of state, pack, batch and number, compiled for the mesh. The state's memory is reused."""
+
+    def spread(function: SumGradients) -> SumGradients:
+        def summed(*arguments: Any) -> tuple[nnx.State, Sums]:
+            return jax.lax.psum(function(*arguments), _AXIS)
+
+        return jax.shard_map(
+            summed, mesh=mesh, in_specs=(_WHOLE, _WHOLE, _SHARED, _SHARED), out_specs=_WHOLE, check_vma=False
+        )
+
     whole, shared = _shardings(mesh)
     return jax.jit(
-        partial(train_step, graphdef, optimizer, config),
+        partial(train_step, graphdef, optimizer.build(num_steps), _share(config, mesh), spread=spread),
         in_shardings=(whole, whole, shared, whole),
         out_shardings=whole,
         donate_argnums=0,
     )
 
 
+@lru_cache(maxsize=4)
 def jit_eval_step(graphdef: nnx.GraphDef, config: StepConfig, mesh: Mesh) -> EvalStep:
     """Return `eval_step` of parameters, pack and batch, compiled for the mesh."""
+
+    def summed(*arguments: Any) -> Sums:
+        return jax.lax.psum(eval_step(graphdef, _share(config, mesh), *arguments), _AXIS)
+
     whole, shared = _shardings(mesh)
-    step = partial(eval_step, graphdef, config)
+    step = jax.shard_map(summed, mesh=mesh, in_specs=(_WHOLE, _WHOLE, _SHARED), out_specs=_WHOLE, check_vma=False)
     return jax.jit(step, in_shardings=(whole, whole, shared), out_shardings=whole)
+
+
+def _share(config: StepConfig, mesh: Mesh) -> StepConfig:
+    """Return what one device computes: its part of the groups that are computed side by side."""
+    return replace(config, groups_at_once=config.groups_at_once and config.groups_at_once // mesh.size)
 
 
 def put_whole(tree: _T, mesh: Mesh) -> _T:
@@ -120,7 +143,7 @@ def any_process(flag: bool, mesh: Mesh) -> Array | bool:
 
 
 def _shardings(mesh: Mesh) -> tuple[NamedSharding, NamedSharding]:
-    return NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(_AXIS))
+    return NamedSharding(mesh, _WHOLE), NamedSharding(mesh, _SHARED)
 
 
 def _put(tree: _T, sharding: NamedSharding) -> _T:

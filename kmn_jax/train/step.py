@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import partial
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import nnx
-from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
+from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.device_pack import DevicePack
@@ -72,6 +74,10 @@ class Sums(NamedTuple):
     num_crops: Float[Array, ""]
 
 
+# Parameters, pack, batch and a dropout key for each of its groups -> gradient and sums.
+SumGradients: TypeAlias = Callable[[nnx.State, DevicePack, SampleIndex, Array], tuple[nnx.State, Sums]]
+
+
 def create_state(config: StepConfig, optimizer: optax.GradientTransformation) -> tuple[nnx.GraphDef, TrainState]:
     """Return the network's structure and the state before the first step."""
     graphdef, parameters = create_model(config.network, jax.random.key(config.seed))
@@ -87,44 +93,59 @@ def train_step(
     pack: DevicePack,
     index: SampleIndex,
     number: Int[Array, ""] | None = None,
+    spread: Callable[[SumGradients], SumGradients] = lambda function: function,
 ) -> tuple[TrainState, Metrics]:
     """Make the examples of a batch, and change the parameters by the gradient of their mean loss.
 
     If loss or gradient are not finite, the state stays what it was, its step too. With `number`, the step that this is
     meant to be, it also stays in all later steps: what is kept is the state before the first one that failed.
+    `spread` may have the sums over the batch computed by several devices.
     """
-    key = jax.random.fold_in(jax.random.key(config.seed), state.step)
-
-    def summed(parameters: nnx.State, chunk: _Chunk) -> tuple[Float[Array, ""], Sums]:
-        sums = _chunk_sums(graphdef, parameters, config, pack, chunk)
-        return sums.loss, sums
-
-    gradient = jax.grad(summed, has_aux=True)
-    chunks = _chunks(index, key, config)
-    if jax.tree.leaves(chunks)[0].shape[0] == 1:
-        grads, sums = gradient(state.parameters, jax.tree.map(lambda leaf: leaf[0], chunks))
-    else:
-
-        def add(carry: tuple[nnx.State, Sums], chunk: _Chunk) -> tuple[tuple[nnx.State, Sums], None]:
-            return jax.tree.map(jnp.add, carry, gradient(state.parameters, chunk)), None
-
-        zeros = (jax.tree.map(jnp.zeros_like, state.parameters), Sums(*(jnp.float32(0),) * len(Sums._fields)))
-        (grads, sums), _ = jax.lax.scan(add, zeros, chunks)
+    groups = index.object.shape[0] // config.crops_per_object
+    dropout = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.step), groups)
+    grads, sums = spread(partial(sum_gradients, graphdef, config))(state.parameters, pack, index, dropout)
     count = jnp.maximum(sums.num_crops, 1)
     grads = jax.tree.map(lambda leaf: leaf / count, grads)
-    norm = optax.global_norm(grads)
+    norm = optax.tree.norm(grads)
     taken = jnp.isfinite(sums.loss) & jnp.isfinite(norm)
     if number is not None:
         taken &= state.step == number
     updates, moments = optimizer.update(grads, state.optimizer, state.parameters)
     parameters = optax.apply_updates(state.parameters, updates)
     # The running mean starts as a plain one: early parameters should not linger.
-    count = state.step.astype(jnp.float32) + 1
-    decay = jnp.minimum(config.average_decay, count / (count + 10))
+    steps = state.step.astype(jnp.float32) + 1
+    decay = jnp.minimum(config.average_decay, steps / (steps + 10))
     average = jax.tree.map(lambda old, new: decay * old + (1 - decay) * new, state.average, parameters)
     changed = TrainState(state.step + 1, parameters, average, moments)
     result = jax.tree.map(lambda new, old: jnp.where(taken, new, old), changed, state)
     return result, mean_metrics(sums)._replace(gradient_norm=norm, taken=taken)
+
+
+def sum_gradients(
+    graphdef: nnx.GraphDef,
+    config: StepConfig,
+    parameters: nnx.State,
+    pack: DevicePack,
+    index: SampleIndex,
+    dropout: Key[Array, " groups"],
+) -> tuple[nnx.State, Sums]:
+    """Return the gradient of the summed loss of a batch, and the sums, with one dropout key for each group."""
+
+    def summed(parameters: nnx.State, chunk: _Chunk) -> tuple[Float[Array, ""], Sums]:
+        sums = _chunk_sums(graphdef, parameters, config, pack, chunk)
+        return sums.loss, sums
+
+    gradient = jax.grad(summed, has_aux=True)
+    chunks = _chunks(index, dropout, config)
+    if jax.tree.leaves(chunks)[0].shape[0] == 1:
+        only: tuple[nnx.State, Sums] = gradient(parameters, jax.tree.map(lambda leaf: leaf[0], chunks))
+        return only
+
+    def add(carry: tuple[nnx.State, Sums], chunk: _Chunk) -> tuple[tuple[nnx.State, Sums], None]:
+        return jax.tree.map(jnp.add, carry, gradient(parameters, chunk)), None
+
+    zeros = (jax.tree.map(jnp.zeros_like, parameters), Sums(*(jnp.float32(0),) * len(Sums._fields)))
+    return jax.lax.scan(add, zeros, chunks)[0]
 
 
 def eval_step(
@@ -149,11 +170,8 @@ class _Chunk(NamedTuple):
     dropout: PRNGKey | None
 
 
-def _chunks(index: SampleIndex, key: PRNGKey | None, config: StepConfig) -> _Chunk:
-    """Split a batch into groups, and those into chunks along a new first axis.
-
-    A chunk takes every n-th group: where devices hold consecutive rows of a batch, each has its share of all chunks.
-    """
+def _chunks(index: SampleIndex, dropout: Key[Array, " groups"] | None, config: StepConfig) -> _Chunk:
+    """Split a batch into groups, and those into chunks along a new first axis."""
     size = index.object.shape[0]
     groups = size // config.crops_per_object
     at_once = config.groups_at_once or groups
@@ -162,16 +180,10 @@ def _chunks(index: SampleIndex, key: PRNGKey | None, config: StepConfig) -> _Chu
             f"a batch of {size} must hold whole chunks of {at_once} groups of crops_per_object ="
             f" {config.crops_per_object}"
         )
-    num_chunks = groups // at_once
-
-    def split(array: Shaped[Array, "b ..."]) -> Shaped[Array, "n c ..."]:
-        return array.reshape(at_once, num_chunks, -1, *array.shape[1:]).swapaxes(0, 1)
-
-    rows, drops, counted, keys = (
-        split(jnp.asarray(array)) for array in (index.object, index.drop, index.mask, index.key)
-    )
-    dropout = None if key is None else split(jax.random.split(key, groups))[:, :, 0]
-    return _Chunk(rows[..., 0], drops, keys, counted, dropout)
+    shape = (groups // at_once, at_once, config.crops_per_object)
+    rows, drops, counted = (jnp.asarray(array).reshape(shape) for array in (index.object, index.drop, index.mask))
+    keys = jnp.asarray(index.key).reshape(*shape, 2)
+    return _Chunk(rows[..., 0], drops, keys, counted, None if dropout is None else dropout.reshape(shape[:2]))
 
 
 def _chunk_sums(
