@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import subprocess
@@ -18,17 +19,17 @@ _IN_PACKAGE = "./usr/share/kicad/3dmodels/"
 
 
 def catalogue_sources(models: Path | None, cache: Path, limit: int | None) -> tuple[list[Source], str]:
-    """Return the catalogue's objects, splits mixed evenly, with their files, and their licence.
+    """Return the catalogue's objects with their files, and their licence.
+
+    They are in an order that mixes splits and families, the same for everybody, so that a first part stands for all.
 
     Without a folder of `models` the Debian package is fetched once and what the catalogue names extracted to `cache`.
     Raises InputError if the package cannot be had.
     """
     catalogue = json.loads(CATALOGUE.read_text(encoding="utf-8"))
-    places = [
-        ((index + 0.5) / len(catalogue[split]), name, split)
-        for split in SPLITS
-        for index, name in enumerate(catalogue[split])
-    ]
+    if limit is not None and limit < 1:
+        raise InputError(f"limit = {limit} must be 1 or more")
+    places = [(hashlib.sha256(name.encode()).digest(), name, split) for split in SPLITS for name in catalogue[split]]
     chosen = sorted(places)[:limit]
     if models is None:
         models = cache

@@ -44,12 +44,21 @@ class ShowData:
     seed: int = 0
     crops: CropConfig = field(default_factory=CropConfig)
 
+    def __post_init__(self) -> None:
+        if min(self.objects, self.drops, self.keypoints) < 1:
+            raise InputError(
+                f"objects = {self.objects}, drops = {self.drops} and keypoints = {self.keypoints} must be 1 or more"
+            )
+
     def run(self) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self.folder} cannot be written to: {error.strerror}") from None
         if self.pack is not None:
             pack = Pack(self.pack)
             for name in _spread(pack.names(), self.objects):
-                self._save(_pack_figure(pack, name, self), f"pack_{Path(name).name}.png")
+                self._save(_pack_figure(pack, name, self), f"pack_{name.replace('/', '_')}.png")
         if self.test_set is not None:
             dataset = BopDataset.open(self.test_set, self.split)
             scenes = sorted({key.scene_id for key in dataset.keys})

@@ -25,7 +25,7 @@ ASSETS = Path(__file__).parent / "assets"
 DIGESTS = ASSETS / "test_sets.json"
 SPLIT = "test"
 CONFIG = PackConfig(seed=1)  # another seed than the training pack's
-_LIBRARIES = ("cascadio", "mujoco", "numpy", "open3d", "scipy", "trimesh")
+_LIBRARIES = ("cascadio", "jax", "mujoco", "numpy", "open3d", "scipy", "trimesh")
 
 
 def industrial_sources() -> list[Source]:
@@ -58,12 +58,24 @@ def build_test_set(folder: Path, sources: list[Source], config: PackConfig = CON
 
 def verdict(name: str, digest: str) -> str:
     """Say how a test set's digest compares with the one that the repository holds."""
-    record = json.loads(DIGESTS.read_text(encoding="utf-8")) if DIGESTS.exists() else {}
-    if record.get("sets", {}).get(name) == digest:
+    record = _record()
+    if record["sets"].get(name) == digest:
         return "as recorded"
-    differing = {key: value for key, value in made_with().items() if record.get("made_with", {}).get(key) != value}
+    differing = {key: value for key, value in made_with().items() if record["made_with"].get(key) != value}
     reason = f"made with other versions ({differing})" if differing else "with the same versions: please report it"
     return f"differs from {DIGESTS.name}, {reason}"
+
+
+def is_unexplained(name: str, digest: str) -> bool:
+    """Tell whether a digest differs from the recorded one though the versions are the same."""
+    return _record()["sets"].get(name) != digest and _record()["made_with"] == made_with()
+
+
+def _record() -> dict[str, dict[str, str]]:
+    if not DIGESTS.exists():
+        return {"sets": {}, "made_with": {}}
+    record: dict[str, dict[str, str]] = json.loads(DIGESTS.read_text(encoding="utf-8"))
+    return record
 
 
 def record_digests(digests: dict[str, str]) -> None:

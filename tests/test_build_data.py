@@ -28,10 +28,10 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-m", *arguments], cwd=ROOT, capture_output=True, text=True)
 
 
-def test_takes_models_from_a_folder_with_the_splits_mixed(tmp_path: Path) -> None:
+def test_takes_models_from_a_folder_with_families_mixed(tmp_path: Path) -> None:
     sources, licence = catalogue_sources(tmp_path, tmp_path / "unused", 60)
     assert len(sources) == 60
-    assert {source.split for source in sources} == {"train", "validation"}
+    assert len({source.name.split("/")[0] for source in sources}) > 20  # families
     assert all(source.path == tmp_path / f"{source.name}.step" for source in sources)
     assert "CC-BY-SA" in licence
     everything, _ = catalogue_sources(tmp_path, tmp_path / "unused", None)
@@ -83,7 +83,10 @@ def test_extracts_only_what_is_named_from_the_package(tmp_path: Path, monkeypatc
     ("arguments", "message"),
     [
         (["electronics", "--models", "absent"], "error: absent is not a folder"),
+        (["electronics", "--models", "experiments"], "1507 of 1507 files are missing"),
+        (["electronics", "--models", "experiments", "--limit", "0"], "limit = 0 must be 1 or more"),
         (["electronics", "--pack.drops", "0"], "drops = 0 must be 1 or more"),
+        (["check", "--folder", "experiments"], "manifest.json cannot be read"),
     ],
 )
 def test_build_data_ends_with_one_sentence_for_bad_input(arguments: list[str], message: str) -> None:
@@ -114,7 +117,7 @@ def test_small_pack_is_whole_and_of_the_recipe() -> None:
 def test_check_counts_copies_outside_and_names_damaged_files(tmp_path: Path) -> None:
     good = run("experiments.build_data", "check", "--folder", str(ASSETS / "small_pack"))
     assert good.returncode == 0, good.stderr
-    assert "6 objects, 0 with damaged files; 60 scenes, 660 copies, 0 of them" in good.stdout
+    assert "6 objects, 0 of them damaged; 60 scenes, 660 copies, 0 of them" in good.stdout
     strict = run("experiments.build_data", "check", "--folder", str(ASSETS / "small_pack"), "--tolerance", "-0.1")
     assert strict.returncode == 1
     shutil.copytree(ASSETS / "small_pack", tmp_path / "pack")
@@ -123,7 +126,7 @@ def test_check_counts_copies_outside_and_names_damaged_files(tmp_path: Path) -> 
     damaged = run("experiments.build_data", "check", "--folder", str(tmp_path / "pack"))
     assert damaged.returncode == 1
     assert f"{name}.safetensors does not match" in damaged.stdout
-    assert "6 objects, 1 with damaged files; 50 scenes" in damaged.stdout
+    assert "6 objects, 1 of them damaged; 50 scenes" in damaged.stdout
 
 
 def test_reach_beyond_the_bin_is_that_of_the_farthest_point() -> None:
@@ -177,6 +180,7 @@ def test_digests_of_the_test_sets_are_recorded_with_what_made_them() -> None:
     assert set(record["sets"]) == {"electronics", "industrial"}
     assert set(record["made_with"]) == set(test_sets.made_with())
     assert len(test_sets.industrial_sources()) == 7
+    assert test_sets.is_unexplained("electronics", "0" * 64) == (record["made_with"] == test_sets.made_with())
     assert "differs from test_sets.json" in test_sets.verdict("electronics", "0" * 64)
     if record["made_with"] == test_sets.made_with():
         assert test_sets.verdict("electronics", record["sets"]["electronics"]) == "as recorded"

@@ -57,29 +57,39 @@ def build_pack(
 ) -> list[Record]:
     """Build a pack in `folder`, or go on with one, and write its manifest; return what became of each source.
 
-    Objects that the journal lists are not made again, but with `retry_rejected` those that were rejected. A file that
-    is broken, takes too long or crashes its process is rejected, with the reason, and the others go on. Raises InputError if the folder holds a pack of another recipe.
+    What the journal lists is not made again, unless its files are gone or, with `retry_rejected`, it was rejected. A
+    file that is broken, takes too long or crashes its process is rejected, with the reason, and the others go on. The
+    manifest lists all that the journal does. Raises InputError if a source's file is missing, or if the folder cannot
+    be written to or holds a pack of another recipe.
     """
     from tqdm import tqdm
 
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    journal = _Journal(folder / "journal.jsonl", config)
+    workers = (os.cpu_count() or 1) if workers is None else workers
+    if workers < 1:
+        raise InputError(f"workers = {workers} must be 1 or more")
+    missing = [str(source.path) for source in sources if not Path(source.path).is_file()]
+    if missing:
+        raise InputError(f"{len(missing)} of {len(sources)} files are missing, {missing[0]} first: nothing was built")
     wanted = {source.name: source for source in sources}
     if len(wanted) != len(sources):
         raise InputError(f"{len(sources) - len(wanted)} sources have the name of another: names must differ")
-    done = {name for name, record in journal.records.items() if not (record.reason and retry_rejected)}
-    left = [source for source in sources if source.name not in done]
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be written to: {error.strerror}") from None
+    journal = _Journal(folder / "journal.jsonl", config)
+    left = [source for source in sources if not _is_done(folder, journal.records.get(source.name), retry_rejected)]
     bar = tqdm(total=len(sources), initial=len(sources) - len(left), unit="object", mininterval=1, smoothing=0.05)
-    for record in _made(folder, left, config, workers or os.cpu_count() or 1, minutes_per_object * 60):
+    for record in _made(folder, left, config, workers, minutes_per_object * 60):
         journal.add(record)
         if record.reason:
             bar.write(f"rejected {record.name}: {record.reason}")
         bar.update()
         if len(journal.records) % 50 == 0:
-            _write_manifest(folder, journal, wanted, config, manifest_facts)
+            _write_manifest(folder, journal, config, manifest_facts)
     bar.close()
-    _write_manifest(folder, journal, wanted, config, manifest_facts)
+    _write_manifest(folder, journal, config, manifest_facts)
     return [journal.records[name] for name in wanted]
 
 
@@ -89,10 +99,15 @@ def one_thread_a_process() -> None:
     os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
 
-def _write_manifest(
-    folder: Path, journal: _Journal, wanted: dict[str, Source], config: PackConfig, facts: dict[str, Any]
-) -> None:
-    records = [journal.records[name] for name in wanted if name in journal.records]
+def _is_done(folder: Path, record: Record | None, retry_rejected: bool) -> bool:
+    if record is None or record.entry is None:
+        return record is not None and not retry_rejected
+    shards = filter(None, (record.entry.objects, record.entry.visibility))
+    return all((folder / shard.path).exists() for shard in shards)
+
+
+def _write_manifest(folder: Path, journal: _Journal, config: PackConfig, facts: dict[str, Any]) -> None:
+    records = [journal.records[name] for name in sorted(journal.records)]
     rejected = [{"name": r.name, "split": r.split, "reason": r.reason} for r in records if r.reason]
     entries = [record.entry for record in records if record.entry]
     write_manifest(folder, entries, recipe=asdict(config), rejected=rejected, **facts)

@@ -154,8 +154,13 @@ def quantised(item: PackedObject) -> PackedObject:
 def write_object(folder: str | Path, item: PackedObject) -> Entry:
     """Write the files of one object into a pack's folder and return its entry for the manifest.
 
-    Give the object as it was made, not read back: rounding twice may differ from once.
+    Give the object as it was made, not read back: rounding twice may differ from once. Raises InputError for a name
+    that is not a path within the folder, and for values that are not finite.
     """
+    _check_inside(f"{item.name}.safetensors")
+    poses = [array for drop in item.drops for array in (drop.scene.T_bin_object, drop.scene.T_camera_bin)]
+    if not all(np.isfinite(array).all() for array in (item.points, item.normals, *poses)):
+        raise InputError(f"{item.name}: points, normals or poses hold NaN or infinite values")
     tensors, metadata = _encode(item)
     objects = _write_shard(Path(folder), "objects", item.name, tensors, metadata)
     bits: dict[str, np.ndarray] = {}
@@ -197,11 +202,15 @@ def read_entry(fields: dict[str, Any]) -> Entry:
         fields["name"], fields["split"], Shard(**objects), None if visibility is None else Shard(**visibility)
     )
     for shard in filter(None, (entry.objects, entry.visibility)):
-        if Path(shard.path).is_absolute() or ".." in Path(shard.path).parts:
-            raise ValueError(f"path {shard.path!r} leaves the pack")
+        _check_inside(shard.path)
     if entry.split not in SPLITS:
         raise ValueError(f"split {entry.split!r} is not one of {', '.join(SPLITS)}")
     return entry
+
+
+def _check_inside(path: str) -> None:
+    if Path(path).is_absolute() or ".." in Path(path).parts:
+        raise InputError(f"path {path!r} leaves the pack")
 
 
 def _write_shard(folder: Path, kind: str, name: str, tensors: dict[str, np.ndarray], metadata: dict[str, Any]) -> Shard:

@@ -202,3 +202,13 @@ def test_refuses_a_manifest_that_is_not_json(pack: Pack, content: bytes) -> None
 def test_refuses_a_folder_without_a_manifest(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="name the folder of a pack"):
         Pack(tmp_path)
+
+
+def test_refuses_to_write_outside_of_the_folder_or_what_is_not_finite(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"\.\./escaped\.safetensors' leaves the pack"):
+        write_object(tmp_path / "pack", packed_object("../escaped"))
+    item = packed_object()
+    item.drops[1].scene.T_bin_object[0, 0, 3] = np.nan
+    with pytest.raises(InputError, match="points, normals or poses hold NaN"):
+        write_object(tmp_path / "pack", item)
+    assert not (tmp_path / "pack").exists()
