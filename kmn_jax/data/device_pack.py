@@ -24,6 +24,10 @@ from kmn_jax.data.splat import (
 )
 from kmn_jax.typing import Scalar
 
+# A pack's 8,192 bin surfels lie a twentieth of the object's diagonal apart; crops draw points from four times as many,
+# nearly as dense as those on objects, so that background is not told by its density.
+BIN_SPLITS = 2
+
 _Any = np.ndarray | Array  # on the host as stacked, on a device once put there
 
 
@@ -146,7 +150,8 @@ def visible_points(scene: PackedScene, splat: SplatConfig | None = None) -> Visi
         return visible_by_splatting(scene.surfels, poses, copies, scene.camera, scene.bin_in_view, splat)
     if scene.bits is None:
         raise InputError("the scene has no visibility bits: stack the pack with visibility=True, or give a SplatConfig")
-    return visible_from_bits(scene.surfels, poses, copies, scene.bits, scene.bin_in_view, scene.bin_bits)
+    splits = 1 if scene.bin_bits is None else BIN_SPLITS
+    return visible_from_bits(scene.surfels, poses, copies, scene.bits, scene.bin_in_view, scene.bin_bits, splits)
 
 
 def _usable(item: PackedObject, visibility: bool) -> PackedObject:

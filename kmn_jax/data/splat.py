@@ -135,12 +135,14 @@ def visible_from_bits(
     bits: UInt8[Array, "c m8"],
     bin_in_view: BinInView | None = None,
     bin_bits: UInt8[Array, " b8"] | None = None,
+    bin_splits: int = 1,
 ) -> VisiblePoints:
     """Return the points that visibility bits name, 8 surfels a byte, the lowest bit first.
 
     `copies` is false for padding, whose poses and bits may hold anything. With a bin and its bits there are 8 bin
-    surfels, those of `bin_surfels`, for each of their bytes. Raises ValueError if bits and surfels differ in number,
-    or if only one of bin and bin bits is given.
+    surfels, those of `bin_surfels`, for each of their bytes. They are few for so large a surface; `bin_splits` cuts the
+    square that each stands for into so many rows and columns of points, which are all visible or none. Raises
+    ValueError if bits and surfels differ in number, or if only one of bin and bin bits is given.
     """
     m = surfels.points.shape[0]
     if 8 * bits.shape[1] != m:
@@ -152,8 +154,9 @@ def visible_from_bits(
     placed = _place(surfels, T_camera_object, copies)
     if bin_in_view is None or bin_bits is None:
         return _gather(placed, visible, num_copies)
-    on_bin = _place_bin(bin_in_view, 8 * bin_bits.shape[0])
-    return _gather(placed, visible, num_copies, on_bin, jnp.unpackbits(bin_bits, bitorder="little") > 0)
+    on_bin = _place_bin(bin_in_view, 8 * bin_bits.shape[0], bin_splits)
+    bin_visible = jnp.tile(jnp.unpackbits(bin_bits, bitorder="little") > 0, bin_splits**2)
+    return _gather(placed, visible, num_copies, on_bin, bin_visible)
 
 
 def visible_by_splatting(
@@ -220,9 +223,17 @@ def _place(surfels: Surfels, T_camera_object: Float[Array, "c 4 4"], copies: Boo
     return _Placed((x, y, z), (nx, ny, nz), plane, surfels.area / m, jnp.repeat(copies, m))
 
 
-def _place_bin(bin_in_view: BinInView, count: int) -> _Placed:
-    pose = bin_in_view.T_camera_bin[None]
-    return _place(bin_surfels(bin_in_view.size, count), pose, jnp.ones(1, dtype=bool))
+def _place_bin(bin_in_view: BinInView, count: int, splits: int = 1) -> _Placed:
+    surfels = bin_surfels(bin_in_view.size, count)
+    if splits > 1:
+        side = jnp.sqrt(surfels.area / count)
+        # Floor normals are (0, 0, 1), those of walls horizontal: the axes' order turned gives two directions across.
+        first = jnp.abs(jnp.roll(surfels.normals, 1, axis=1))
+        second = jnp.abs(jnp.roll(surfels.normals, 2, axis=1))
+        steps = [(2 * step + 1 - splits) / (2 * splits) for step in range(splits)]
+        parts = [surfels.points + side * (u * first + v * second) for u in steps for v in steps]
+        surfels = Surfels(jnp.concatenate(parts), jnp.tile(surfels.normals, (splits**2, 1)), surfels.area)
+    return _place(surfels, bin_in_view.T_camera_bin[None], jnp.ones(1, dtype=bool))
 
 
 def _facing(placed: _Placed) -> Mask:

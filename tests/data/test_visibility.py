@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from kmn_jax.data.cad import ObjectConfig, load_object
+from kmn_jax.data.crops import CropConfig, draw_crop
 from kmn_jax.data.device_pack import DevicePack, stack_pack, take_scene, visible_points
 from kmn_jax.data.pack import Pack, quantised
 from kmn_jax.data.raycast import RayMesh, pack_bits, visible_surfels
@@ -58,3 +60,33 @@ def test_bits_of_a_pack_are_those_of_rays_to_what_is_read_back() -> None:
         seen = visible_surfels(rays, exact.scene, stored.points, stored.normals)
         assert 0.1 < seen.mean() < 0.6
         np.testing.assert_array_equal(pack_bits(seen), drop.bits)
+
+
+@partial(jax.jit, static_argnames="config")
+def shares(
+    arrays: DevicePack, row: Int[Array, ""], drop: Int[Array, ""], key: jax.Array, config: CropConfig
+) -> Float[Array, " 2"]:
+    """Return the seed's copy's share of the picture within the crop's radius, and of the crop's points."""
+    scene = take_scene(arrays, row, drop)
+    visible = visible_points(scene)
+    keypoints = scene.surfels.points[:20]
+    crop = draw_crop(key, visible, keypoints, scene.T_camera_object, scene.diameter, config)
+    near = ((visible.points - crop.seed[None]) ** 2).sum(axis=1) <= scene.diameter**2
+    area = jnp.where(visible.mask & near, visible.picture_area, 0)
+    copy = jnp.where(visible.instance == crop.instance, area, 0)
+    return jnp.stack([copy.sum() / area.sum(), crop.is_object.sum() / crop.mask.sum()])
+
+
+def test_background_is_as_dense_in_a_crop_as_in_a_picture() -> None:
+    """Even with two copies in a bin, whose floor then fills most of a crop of 2048 points."""
+    pack = Pack(ASSETS / "small_pack")
+    arrays = jax.device_put(stack_pack(pack, "train").arrays)
+    config = CropConfig(num_points=2048, max_noise=0.0, normals="surface")
+    found = [
+        shares(arrays, jnp.int32(row), jnp.int32(0), jax.random.key(key), config)
+        for row in range(4)
+        for key in range(4)
+    ]
+    in_picture, in_crop = np.mean(np.array(found), axis=0)
+    assert 0.1 < in_picture < 0.3
+    np.testing.assert_allclose(in_crop, in_picture, rtol=0.2)
