@@ -104,7 +104,7 @@ class Check:
     """Check the files of a pack, and that all copies are inside of their bins."""
 
     folder: Path = OUTPUTS / "packs" / "electronics"
-    tolerance: float = 0.003  # share of the diameter by which a copy may reach into wall or floor
+    tolerance: float = 0.003  # share of the object's diagonal by which a copy may reach into wall or floor
 
     def run(self) -> None:
         from tqdm import tqdm
@@ -121,13 +121,14 @@ class Check:
             except InputError:
                 damaged += 1  # listed above
                 continue
+            diagonal = float(np.linalg.norm(np.ptp(item.points, axis=0)))
             for drop in item.drops:
-                reach = reach_beyond_bin(item, drop.scene) / item.diameter
+                reach = reach_beyond_bin(item, drop.scene) / diagonal
                 scenes, copies = scenes + 1, copies + len(reach)
                 outside, worst = outside + int((reach > self.tolerance).sum()), max(worst, float(reach.max()))
         print(
             f"{len(pack.names())} objects, {damaged} of them damaged; {scenes} scenes, {copies} copies, {outside} of"
-            f" them more than {self.tolerance:.1%} of the diameter into a wall or the floor, the most {worst:.2%}"
+            f" them more than {self.tolerance:.1%} of the diagonal into a wall or the floor, the most {worst:.2%}"
         )
         if problems or outside or not scenes:
             sys.exit(1)
