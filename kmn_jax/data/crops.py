@@ -107,7 +107,8 @@ def draw_crop(
     ranks = jnp.where(inside, weights, -jnp.inf) + jax.random.gumbel(draw_key, (total,))
     ranks = ranks.at[seed_row].set(jnp.where(found, jnp.inf, -jnp.inf))
     # Without the barrier XLA merges later slices into the selection, which then falls back to a full sort.
-    top, rows = jax.lax.optimization_barrier(jax.lax.top_k(ranks, min(config.num_drawn, total)))
+    # (One for each of the two: under shard_map XLA fails on one for both.)
+    top, rows = map(jax.lax.optimization_barrier, jax.lax.top_k(ranks, min(config.num_drawn, total)))
     drawn = top > -jnp.inf
 
     exact = jnp.where(drawn[:, None], visible.points[rows], 0)

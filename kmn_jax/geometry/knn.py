@@ -62,7 +62,8 @@ def _k_smallest(
     if mask is not None:
         distances = jnp.where(mask[None, :], distances, jnp.inf)
     values, indices = jax.lax.top_k(-distances, k)
-    return values, indices
+    # Under shard_map XLA fails where one barrier, the caller's, takes both results as they are.
+    return jax.lax.optimization_barrier(values), jax.lax.optimization_barrier(indices)
 
 
 def _k_smallest_in_parts(

@@ -342,7 +342,7 @@ class _Run:
         raise NotFiniteError(
             f"step {done.number}, with the objects {some}, gave loss {metrics.loss} and gradient norm"
             f" {metrics.gradient_norm}: the state before it and the batch are in {apart}, the last checkpoint is as it"
-            " was; look for the cause there, or import an export of it into another folder with other values"
+            " was; look for the cause there, or export the run and import it into another folder with other values"
         )
 
 

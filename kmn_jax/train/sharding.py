@@ -149,7 +149,8 @@ def _shardings(mesh: Mesh) -> tuple[NamedSharding, NamedSharding]:
 def _put(tree: _T, sharding: NamedSharding) -> _T:
     if jax.process_count() == 1:
         return jax.device_put(tree, sharding)
-    return jax.tree.map(lambda array: jax.make_array_from_process_local_data(sharding, np.asarray(array)), tree)
+    with jax.transfer_guard("allow"):  # explicit as it is, JAX takes it for an implicit transfer
+        return jax.tree.map(lambda array: jax.make_array_from_process_local_data(sharding, np.asarray(array)), tree)
 
 
 @partial(jax.jit, static_argnums=1)
