@@ -12,3 +12,4 @@ python3 -c 'import jax; print(jax.__version__, jax.devices())'
 python3 -m benchmarks.network --batches 1 4 16 64 --dense-up-to 4 --no-memory --json "$output/network.json" 2>&1 | tee "$output/network.txt"
 python3 -m benchmarks.knn --json "$output/knn.json" 2>&1 | tee "$output/knn.txt"
 python3 -m benchmarks.pose --draws 40 --json "$output/pose.json" 2>&1 | tee "$output/pose.txt"
+python3 -m benchmarks.scenes --batches 1 64 256 --json "$output/scenes.json" 2>&1 | tee "$output/scenes.txt"

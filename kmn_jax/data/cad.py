@@ -11,11 +11,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from kmn_jax.checks import InputError
-from kmn_jax.data.mesh_files import METRES, check_unit, read_mesh
+from kmn_jax.data.mesh_files import METRES, check_triangles, check_unit, read_mesh
 from kmn_jax.data.surface import OuterSurface, outer_surface
 from kmn_jax.data.symmetry import Distance, Symmetries, find_symmetries
 
 _MAX_HULL = 3000  # vertices whose distances are all taken
+_MAX_CLOUD = 40_000  # points from which normals are estimated: dense enough for edges, sparse enough for noise
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,10 @@ class ObjectConfig:
     def __post_init__(self) -> None:
         if self.num_points < 64:
             raise InputError(f"num_points = {self.num_points} cannot stand for a surface: take 64 or more")
+        if not 0 < self.symmetry_tolerance <= 0.2:
+            raise InputError(f"symmetry_tolerance = {self.symmetry_tolerance} must be above 0 and at most 0.2")
+        if self.seed < 0:
+            raise InputError(f"seed = {self.seed} must be 0 or more")
 
 
 @dataclass(frozen=True)
@@ -105,11 +110,13 @@ def object_from_mesh(
     config: ObjectConfig | None = None,
     digest: str | None = None,
 ) -> ObjectModel:
-    """Make an object model of a mesh, watertight or not. Raises InputError if it has no surface to see."""
+    """Make an object model of a mesh, watertight or not. Raises InputError if it has no surface to see, or is flat."""
     import open3d
 
     config = config or ObjectConfig()
+    check_triangles(vertices, triangles)
     outer = outer_surface(vertices, triangles, config.num_points, config.seed)
+    _refuse_flat(outer.vertices)
     minimum, maximum = outer.vertices.min(axis=0), outer.vertices.max(axis=0)
     middle, scale = (minimum + maximum) / 2, float(np.linalg.norm(maximum - minimum))
     scene = open3d.t.geometry.RaycastingScene(nthreads=1)
@@ -141,43 +148,46 @@ def object_from_cloud(
 
     Without normals they are estimated and oriented consistently, outwards. Symmetries are found to the tolerance
     plus the spacing of the points. Raises InputError for fewer points than the config asks for, since a sparse
-    cloud cannot stand for a surface.
+    cloud cannot stand for a surface, and for points in one plane.
     """
     import open3d
     from scipy.spatial import cKDTree
 
     config = config or ObjectConfig()
-    if len(points) < config.num_points:
+    check_triangles(points, np.zeros((0, 3), np.int32))
+    distinct = np.sort(np.unique(points, axis=0, return_index=True)[1])
+    if len(distinct) < config.num_points:
         raise InputError(
-            f"the cloud has {len(points)} points, but {config.num_points} are needed: scan it more densely"
+            f"the cloud has {len(distinct)} different points, but {config.num_points} are needed: scan it more densely"
         )
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
-    given = False
-    if normals is not None and np.isfinite(normals).all() and np.any(normals, axis=1).all():
-        given = True
-        cloud.normals = open3d.utility.Vector3dVector(normals.astype(np.float64))
+    _refuse_flat(points[distinct])
+    generator = np.random.default_rng(config.seed)
+    if len(distinct) > _MAX_CLOUD:
+        distinct = np.sort(generator.choice(distinct, _MAX_CLOUD, replace=False))
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points[distinct].astype(np.float64)))
+    given = normals is not None and bool(np.isfinite(normals).all() and np.any(normals, axis=1).all())
+    if normals is not None and given:
+        cloud.normals = open3d.utility.Vector3dVector(normals[distinct].astype(np.float64))
         cloud.normalize_normals()
     else:
         cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(30))
+    if len(distinct) > 5 * config.num_points:
+        cloud = cloud.select_by_index(np.sort(generator.choice(len(distinct), 5 * config.num_points, replace=False)))
+    if not given:
         cloud.orient_normals_consistent_tangent_plane(30)
-    if len(points) > 5 * config.num_points:
-        rows = np.random.default_rng(config.seed).choice(len(points), 5 * config.num_points, replace=False)
-        cloud = cloud.select_by_index(np.sort(rows))
     thinned = cloud.farthest_point_down_sample(config.num_points)
     kept, directions = np.asarray(thinned.points), np.asarray(thinned.normals)
     center = kept.mean(axis=0)
     if not given and ((kept - center) * directions).sum() < 0:
         directions = -directions
     size = float(np.linalg.norm(np.ptp(kept, axis=0)))
-    if not size > 0 or np.linalg.matrix_rank(kept - center, tol=1e-6 * size) < 2:
-        raise InputError("the cloud's points coincide or lie on a line: that is not a part's surface")
-    tree, spacing = cKDTree(points), float(np.median(cKDTree(kept).query(kept, k=2)[0][:, 1]))
+    tree, spacing = cKDTree(points[distinct]), float(np.median(cKDTree(kept).query(kept, k=2)[0][:, 1]))
     outer = OuterSurface(
         vertices=points.astype(np.float64),
         triangles=np.zeros((0, 3), np.int32),
         points=kept.astype(np.float32),
         normals=directions.astype(np.float32),
-        area=len(kept) * spacing**2 * 3**0.5 / 2,  # as if packed in hexagons
+        area=_covered_area(np.asarray(cloud.points)),
         hidden_share=0.0,
     )
     tolerance = min(config.symmetry_tolerance + spacing / size, 0.2)
@@ -196,15 +206,21 @@ class _Shape(NamedTuple):
 
 def _model(name: str, unit: str, outer: OuterSurface, shape: _Shape, digest: str) -> ObjectModel:
     import jax.numpy as jnp
+    from scipy.spatial.distance import cdist
 
     from kmn_jax.geometry import farthest_point_indices
 
-    diameter = _diameter(outer.vertices)
+    extremes = _extremes(outer.vertices)
+    diameter = float(cdist(extremes, extremes).max())
     # Centred and of unit size: float32 then has digits to tell the distances apart.
     scaled = jnp.asarray((outer.points - shape.center) / diameter, jnp.float32)
     order = np.asarray(farthest_point_indices(scaled, len(scaled)))
     points = outer.points[order]
     center, moments, distance, tolerance = shape
+    # Corners are where a wrong rotation shows most, but no random point hits one; a cloud's outermost points are noise.
+    probes = (
+        np.concatenate([points.astype(np.float64), extremes]) if len(outer.triangles) else points.astype(np.float64)
+    )
     return ObjectModel(
         name=name,
         unit=check_unit(unit),
@@ -217,25 +233,39 @@ def _model(name: str, unit: str, outer: OuterSurface, shape: _Shape, digest: str
         diameter=diameter,
         area=outer.area,
         hidden_share=outer.hidden_share,
-        symmetries=find_symmetries(points.astype(np.float64), center, moments, distance, diameter, tolerance),
+        symmetries=find_symmetries(probes, center, moments, distance, diameter, tolerance),
         digest=digest,
     )
 
 
-def _diameter(vertices: Float[np.ndarray, "v 3"]) -> float:
-    """Return the largest distance between vertices, of which only the convex hull's can have it."""
-    from scipy.spatial import ConvexHull, QhullError
-    from scipy.spatial.distance import cdist
+def _refuse_flat(points: Float[np.ndarray, "n 3"]) -> None:
+    offsets = points - points.mean(axis=0)
+    if np.linalg.matrix_rank(offsets, tol=1e-6 * float(np.linalg.norm(offsets))) < 3:
+        raise InputError("all points lie in one plane or on a line: that is not a part's surface")
 
-    centered = vertices - vertices.mean(axis=0)
+
+def _covered_area(points: Float[np.ndarray, "n 3"]) -> float:
+    """Estimate the area of the surface that points lie on, however densely: each stands for its neighbours' share."""
+    from scipy.spatial import cKDTree
+
+    radius = cKDTree(points).query(points, k=17)[0][:, -1]
+    return float(np.pi / 16 * (radius**2).sum())
+
+
+def _extremes(vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "h 3"]:
+    """Return the vertices of the convex hull, or of large ones about 3,000 that leave out 0.1% of its size at most."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    center = vertices.mean(axis=0)
+    centered = vertices - center
     try:
-        centered = centered[ConvexHull(centered).vertices]
+        hull = centered[ConvexHull(centered).vertices]
     except QhullError:  # flat: then the hull joggled out of the plane serves
-        centered = centered[ConvexHull(centered, qhull_options="QJ").vertices]
-    if len(centered) > _MAX_HULL:  # the hull's extremes along that many directions miss 0.1% of the diameter at most
+        hull = centered[ConvexHull(centered, qhull_options="QJ").vertices]
+    if len(hull) > _MAX_HULL:
         directions = np.random.default_rng(0).normal(size=(_MAX_HULL, 3))
-        centered = centered[np.unique((directions @ centered.T).argmax(axis=1))]
-    return float(cdist(centered, centered).max())
+        hull = hull[np.unique((directions @ hull.T).argmax(axis=1))]
+    return hull + center
 
 
 def _digest(*arrays: np.ndarray) -> str:

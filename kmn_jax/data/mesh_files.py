@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int32, Int64
+from jaxtyping import Float, Float64, Int, Int32, Int64
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.cloud_files import parse_pcd, parse_xyz
@@ -66,7 +66,9 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     content = _read(path)
     try:
         vertices, normals, triangles = _parse(content, suffix)
-        _check(vertices, triangles, suffix)
+        if len(triangles) == 0 and suffix not in CLOUD_SUFFIXES:
+            raise InputError(f"it holds no triangles: it is empty, truncated or not a {suffix} file")
+        check_triangles(vertices, triangles)
     except InputError as error:
         raise InputError(f"{path} cannot be used: {error}") from None
     except MemoryError:
@@ -130,20 +132,19 @@ def _parse_glb(content: bytes) -> _Parsed:
     return np.concatenate(vertices), None, np.concatenate(triangles)
 
 
-def _check(vertices: Float64[np.ndarray, "v 3"], triangles: Int64[np.ndarray, "t 3"], suffix: str) -> None:
-    if len(triangles) == 0 and suffix not in CLOUD_SUFFIXES:
-        raise InputError(f"it holds no triangles: it is empty, truncated or not a {suffix} file")
+def check_triangles(vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]) -> None:
+    """Raise InputError for no vertices, NaN, infinite or huge ones, and for triangles that name others."""
     if len(vertices) == 0:
-        raise InputError("it holds no points")
+        raise InputError("there are no points")
     bad = ~(np.abs(vertices) <= _FARTHEST).all(axis=1)
     if bad.any():
         raise InputError(
-            f"{bad.sum()} of its {len(bad)} vertices are NaN, infinite or beyond {_FARTHEST:g}, the first is number"
+            f"{bad.sum()} of {len(bad)} vertices are NaN, infinite or beyond {_FARTHEST:g}, the first is number"
             f" {int(bad.argmax())}: export the part again"
         )
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(vertices)):
         raise InputError(
-            f"its triangles name vertices from {triangles.min()} to {triangles.max()}, but it has 0 to"
+            f"triangles name vertices from {triangles.min()} to {triangles.max()}, but there are 0 to"
             f" {len(vertices) - 1}: export the part again"
         )
 

@@ -132,7 +132,7 @@ def _hemisphere(normals: Float[np.ndarray, "n 3"], count: int) -> Float[np.ndarr
     height = 1 - (1 - np.sin(np.radians(10))) * index / count
     angle, radius = np.pi * (1 + 5**0.5) * index, np.sqrt(1 - height**2)
     local = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1).astype(np.float32)
-    axis = np.where(np.abs(normals[:, 2:]) < 0.9, np.float32([[0, 0, 1]]), np.float32([[1, 0, 0]]))
+    axis = np.where(np.abs(normals[:, 2:]) < 0.9, np.array([[0, 0, 1]], np.float32), np.array([[1, 0, 0]], np.float32))
     first = np.cross(axis, normals)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     second = np.cross(normals, first)

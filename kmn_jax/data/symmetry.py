@@ -3,12 +3,17 @@
 Such a rotation fixes the centroid of the surface, and its second moments. So an axis of order three or more is a
 principal axis whose other two moments are equal, an axis of order two is a principal axis or lies in a plane of equal
 moments, and only where all three are equal need every direction be tried.
+
+Rotations near to a symmetry hold too, within the tolerance. What is returned is therefore built as one of the finite
+rotation groups (cyclic, dihedral, tetrahedral, octahedral, icosahedral), all of whose members hold.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -19,8 +24,10 @@ Distance = Callable[[np.ndarray], np.ndarray]  # (n, 3) points to (n,) distances
 
 _MAX_ORDER = 36
 _PRIMES = (2, 3, 5, 7, 11, 13)  # every order tried is a multiple of one of these
-_SAME_MOMENT = 0.03  # two moments this close, relative to the largest, may belong to equal ones
 _COARSE_POINTS = 256
+_SAME_AXIS = np.cos(np.radians(6))
+# Angles between neighbouring axes of order 5 in the icosahedral group, 4 in the octahedral, 3 in the tetrahedral one.
+_POLYHEDRAL = ((5, np.arctan(2)), (4, np.pi / 2), (3, np.arccos(1 / 3)))
 
 
 @dataclass(frozen=True)
@@ -54,29 +61,36 @@ def find_symmetries(
     `center` and `moments` are the surface's area centroid and covariance, `points` lie on it, `distance` returns
     the distances of points from it. Orders up to 36 are tried; an axis that passes them all is continuous, one
     that fails some is not, however fine its teeth. With a continuous axis only rotations that are not about it are
-    listed: one half turn across it, if that is a symmetry. Raises InputError for a tolerance outside of (0, 0.2].
+    listed: one half turn across it, if that is a symmetry. The discrete rotations are the largest group found; an
+    order counts only if its rotations fit clearly better than others about the axis.
+    Raises InputError for a tolerance outside of (0, 0.2].
     """
     if not 0 < tolerance <= 0.2:
         raise InputError(f"tolerance = {tolerance} must be a share of the diameter above 0 and at most 0.2")
-    search = _Search(points, center, distance, tolerance * diameter)
+    search = _Search(points, center, distance, float(tolerance * diameter))
     values, vectors = np.linalg.eigh(moments)
-    equal = [abs(values[i] - values[j]) <= _SAME_MOMENT * values.max() for i, j in ((1, 2), (0, 2), (0, 1))]
-    isotropic = equal[1] or (equal[0] and equal[2])  # smallest and largest alike: all three are
-    axes = _sphere_directions(1500) if isotropic else vectors.T
-    generators: list[np.ndarray] = []
-    for prime in (2, 3, 5) if isotropic else _PRIMES:
-        for axis in search.nearly(axes, prime):
-            axis = search.refined(axis, prime)
-            multiples = range(prime, _MAX_ORDER + 1, prime)
-            orders = [order for order in multiples if search.holds(rotation_about(axis, 2 * np.pi / order))]
-            if len(orders) == len(multiples):
-                return search.continuous(axis, tolerance)
-            generators += [rotation_about(axis, 2 * np.pi / order) for order in orders]
+    # A rotation that moves no point further than the bound from the surface changes no spread by more.
+    spreads = np.sqrt(np.maximum(values, 0))
+    equal = [abs(spreads[i] - spreads[j]) <= search.bound for i, j in ((1, 2), (0, 2), (0, 1))]
+    isotropic = equal[1]  # the smallest and the largest
+    axes = np.concatenate([vectors.T, _sphere_directions(1500)]) if isotropic else vectors.T
+    spins: list[_Spin] = []
+    for prime in (5, 3, 2) if isotropic else _PRIMES:
+        for start in search.nearly(axes, prime):
+            if any(abs(start @ spin.axis) > _SAME_AXIS and spin.order % prime == 0 for spin in spins):
+                continue
+            axis = search.refined(start, prime)
+            if search.is_continuous(axis):
+                return search.about_continuous(axis, tolerance)
+            order = search.order_about(axis)
+            if order > prime:  # the higher order knows the axis better
+                finer = search.refined(axis, order)
+                axis = finer if search.all_hold(_cyclic(finer, order)) else axis
+            if order > 1:
+                spins.append(_Spin(axis, order))
     if not isotropic:
-        for axis in (vectors[:, index] for index in range(3) if equal[index]):
-            half_turns = (_half_turn(search.refined(way, 2)) for way in search.nearly(_around(axis, 180), 2))
-            generators += next(([turn] for turn in half_turns if search.holds(turn)), [])
-    return Symmetries(search.closed(generators), np.zeros((0, 3)), center, tolerance)
+        spins += [_Spin(vectors[:, index], 1) for index in range(3) if equal[index]]
+    return Symmetries(search.largest_group(spins), np.zeros((0, 3)), center, tolerance)
 
 
 def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
@@ -84,6 +98,11 @@ def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarr
     x, y, z = axis
     skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
+
+
+class _Spin(NamedTuple):
+    axis: np.ndarray
+    order: int
 
 
 class _Search:
@@ -99,10 +118,38 @@ class _Search:
         points = self.points if points is None else points
         return float(self.distance(points @ rotation.T + self.center).max())
 
+    def deviations(
+        self, rotations: Float[np.ndarray, "r 3 3"], points: Float[np.ndarray, "n 3"]
+    ) -> Float[np.ndarray, " r"]:
+        turned = np.einsum("rij,nj->rni", rotations, points).reshape(-1, 3) + self.center
+        return self.distance(turned).reshape(len(rotations), -1).max(axis=1)
+
     def holds(self, rotation: Float[np.ndarray, "3 3"]) -> bool:
         return self.deviation(rotation, self.coarse) <= self.bound and self.deviation(rotation) <= self.bound
 
-    def continuous(self, axis: Float[np.ndarray, "3"], tolerance: float) -> Symmetries:
+    def is_continuous(self, axis: Float[np.ndarray, "3"]) -> bool:
+        orders = range(2, _MAX_ORDER + 1)
+        return all(self.holds(_turn(axis, order)) for order in orders)
+
+    def order_about(self, axis: Float[np.ndarray, "3"]) -> int:
+        """Return the largest order whose rotations all hold, and fit clearly better than any others about the axis.
+
+        On an axis that is nearly continuous, rotations in between the true ones hold now and then too; those that make
+        a group of a wrong order come at least two thirds of the way to the worst one.
+        """
+        limit = None
+        for order in range(_MAX_ORDER, 1, -1):
+            group = _cyclic(axis, order)
+            if self.deviation(group[1], self.coarse) > self.bound or not self.all_hold(group):
+                continue
+            if limit is None:
+                some = np.stack([rotation_about(axis, angle) for angle in np.radians(np.arange(5, 181, 5))])
+                limit = 0.6 * float(self.deviations(some, self.coarse).max())
+            if self.deviations(group, self.coarse).max() <= limit:
+                return order
+        return 1
+
+    def about_continuous(self, axis: Float[np.ndarray, "3"], tolerance: float) -> Symmetries:
         """Return the symmetries of a body of revolution: about its axis, maybe turned over, maybe a sphere."""
         across = _across(axis)[0]
         turned_over = [_half_turn(across)] if self.holds(_half_turn(across)) else []
@@ -117,49 +164,83 @@ class _Search:
         outermost points by 3% of the size.
         """
         for points in (self.coarse[:: len(self.coarse) // 32], self.coarse):
-            turned = [points @ rotation_about(axis, 2 * np.pi / order).T + self.center for axis in axes]
-            if turned:
-                deviations = self.distance(np.concatenate(turned)).reshape(len(axes), -1).max(axis=1)
+            if len(axes):
+                deviations = self.deviations(np.stack([_turn(axis, order) for axis in axes]), points)
                 axes = axes[np.argsort(deviations, kind="stable")[: (deviations <= 3 * self.bound).sum()]]
         return axes[:24]
 
-    def refined(self, axis: Float[np.ndarray, "3"], order: int) -> Float[np.ndarray, "3"]:
-        """Turn an axis to where its rotation fits the surface best, by halving steps across it."""
-        best, step = self.deviation(rotation_about(axis, 2 * np.pi / order), self.coarse), np.radians(1.5)
-        while step > np.radians(0.05):
-            trials = [axis + step * way for side in _across(axis) for way in (side, -side)]
+    def refined(
+        self, axis: Float[np.ndarray, "3"], order: int, about: Float[np.ndarray, "3"] | None = None
+    ) -> Float[np.ndarray, "3"]:
+        """Turn an axis, in any way or only about another one, to where its rotation fits best, by halving steps."""
+        best, step = self.deviation(_turn(axis, order), self.coarse), np.radians(1.5)
+        while step > np.radians(0.02):
+            sides = _across(axis) if about is None else (np.cross(about, axis),)
+            trials = [axis + step * way for side in sides for way in (side, -side)]
             trials = [trial / np.linalg.norm(trial) for trial in trials]
-            scores = [self.deviation(rotation_about(trial, 2 * np.pi / order), self.coarse) for trial in trials]
-            if min(scores) < best:
-                best, axis = min(scores), trials[int(np.argmin(scores))]
+            scores = self.deviations(np.stack([_turn(trial, order) for trial in trials]), self.coarse)
+            if scores.min() < best:
+                best, axis = float(scores.min()), trials[int(scores.argmin())]
             else:
                 step /= 2
         return axis
 
-    def closed(self, generators: list[Float[np.ndarray, "3 3"]]) -> Float[np.ndarray, "s 3 3"]:
-        """Return the group that generators span, as far as each member holds on the geometry."""
-        group = [np.eye(3)]
-        for generator in generators:
-            if not _contains(group, generator):
-                group.append(generator)
-        index = 1
-        while index < len(group) and len(group) <= 120:  # the icosahedron has 60 rotations, a fine wheel 72
-            for other in group[1 : index + 1]:
-                for product in (group[index] @ other, other @ group[index]):
-                    if not _contains(group, product) and self.holds(product):
-                        group.append(product)
-            index += 1
-        return np.stack(group)
+    def all_hold(self, group: Float[np.ndarray, "s 3 3"]) -> bool:
+        middle = len(group) // 2  # about an axis, the rotation by about half a turn tells most
+        return all(self.holds(rotation) for rotation in (*group[middle:], *group[1:middle]))
+
+    def largest_group(self, spins: list[_Spin]) -> Float[np.ndarray, "s 3 3"]:
+        """Return the largest group, all of whose members hold, to which axes and their orders lead."""
+        for order, angle in _POLYHEDRAL:
+            axes = [spin.axis for spin in spins if spin.order % order == 0]
+            for first, second in combinations(axes, 2):
+                second = second if first @ second > 0 else -second
+                if abs(np.arccos(min(1.0, first @ second)) - angle) < np.radians(6):
+                    group = _polyhedral(first, second, order, angle)
+                    if self.all_hold(group):
+                        return group
+        best = np.eye(3)[None]
+        for axis, order in sorted(spins, key=lambda spin: -spin.order):
+            if 2 * order <= len(best):
+                break
+            if order > len(best):
+                best = _cyclic(axis, order)
+            others = [spin.axis for spin in spins if abs(spin.axis @ axis) < 0.1]
+            for way in self.nearly(np.stack([*others, *_around(axis, 180)]), 2):
+                way = way - way @ axis * axis
+                turn = _half_turn(self.refined(way / np.linalg.norm(way), 2, about=axis))
+                dihedral = np.concatenate([_cyclic(axis, order), turn @ _cyclic(axis, order)])
+                if self.all_hold(dihedral):
+                    best = dihedral
+                    break
+        return best
+
+
+def _turn(axis: Float[np.ndarray, "3"], order: int) -> Float[np.ndarray, "3 3"]:
+    return rotation_about(axis, 2 * np.pi / order)
 
 
 def _half_turn(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return 2 * np.outer(axis, axis) - np.eye(3)
 
 
-def _contains(group: list[Float[np.ndarray, "3 3"]], rotation: Float[np.ndarray, "3 3"]) -> bool:
-    # trace(A B^T) = 1 + 2 cos(angle between them): below 5 degrees they are the same, up to the tolerance
-    limit = 1 + 2 * np.cos(np.radians(5))
-    return bool((np.einsum("nij,ij->n", np.stack(group), rotation) > limit).any())
+def _cyclic(axis: Float[np.ndarray, "3"], order: int) -> Float[np.ndarray, "s 3 3"]:
+    return np.stack([rotation_about(axis, 2 * np.pi * index / order) for index in range(order)])
+
+
+def _polyhedral(
+    first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"], order: int, angle: float
+) -> Float[np.ndarray, "s 3 3"]:
+    """Return the group that two axes span, the second one moved to the exact angle from the first."""
+    across = second - second @ first * first
+    second = np.cos(angle) * first + np.sin(angle) * across / np.linalg.norm(across)
+    generators = [_turn(first, order), _turn(second, order)]
+    group = [np.eye(3)]
+    for member in group:  # which grows
+        for product in (member @ generator for generator in generators):
+            if np.einsum("nij,ij->n", np.stack(group), product).max() < 2.9:  # 3 for equal ones, 2.6 for neighbours
+                group.append(product)
+    return np.stack(group)
 
 
 def _around(axis: Float[np.ndarray, "3"], count: int) -> Float[np.ndarray, "n 3"]:

@@ -46,15 +46,24 @@ def ring(radii: np.ndarray) -> np.ndarray:
 
 def revolution(profile: list[tuple[float, float]], sections: int = 64) -> Mesh:
     """Return the surface that pairs (radius, z), from the lowest to the highest, sweep about z."""
-    angles = 2 * np.pi * np.arange(sections) / sections
-    around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    vertices = np.concatenate([np.insert(radius * around, 2, z, axis=1) for radius, z in profile])
+    radii, heights = np.array(profile, dtype=float).T
+    return tube(np.tile(radii[:, None], (1, sections)), heights)
+
+
+def tube(radii: np.ndarray, heights: np.ndarray) -> Mesh:
+    """Return the surface between outlines one above the other: a row of radii at even angles for each height."""
+    rows, sections = radii.shape
+    rings = [np.insert(ring(radius), 2, z, axis=1) for radius, z in zip(radii, heights, strict=True)]
+    vertices = np.concatenate(rings)
     i = np.arange(sections)
     j = (i + 1) % sections
     triangles = []
-    for start in range(0, sections * (len(profile) - 1), sections):
-        triangles += [np.stack([i, j, j + sections], axis=1) + start]
-        triangles += [np.stack([i, j + sections, i + sections], axis=1) + start]
+    for row in range(rows - 1):
+        below, above = row * sections, (row + 1) * sections
+        if radii[row].any():
+            triangles.append(np.stack([i + below, j + below, j + above], axis=1))
+        if radii[row + 1].any():
+            triangles.append(np.stack([i + below, j + above, i + above], axis=1))
     return vertices, np.concatenate(triangles)
 
 
