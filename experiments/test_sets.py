@@ -9,17 +9,23 @@ from __future__ import annotations
 import json
 import platform
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
 from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
 
+import numpy as np
+
 from experiments.kicad import catalogue_sources
+from kmn_jax.checks import InputError
 from kmn_jax.data.bop import BopDataset, dataset_digest, finest_depth_scale, write_camera, write_models, write_scene
 from kmn_jax.data.build import Source, one_thread_a_process
 from kmn_jax.data.cad import ObjectModel, load_object
 from kmn_jax.data.hulls import collision_shape
 from kmn_jax.data.raycast import RayMesh
-from kmn_jax.data.recipe import PackConfig, bin_scenes, exact_frame
+from kmn_jax.data.recipe import PackConfig, bin_scenes, rendered_frame
+from kmn_jax.data.sensor import PERFECT, SensorConfig
+from kmn_jax.files import write_whole
 
 ASSETS = Path(__file__).parent / "assets"
 DIGESTS = ASSETS / "test_sets.json"
@@ -38,15 +44,25 @@ def electronics_sources(models: Path | None, cache: Path) -> list[Source]:
     return [source for source in catalogue_sources(models, cache, None)[0] if source.split == "test"]
 
 
-def build_test_set(folder: Path, sources: list[Source], config: PackConfig = CONFIG, workers: int | None = None) -> str:
-    """Write a test set, but for scenes that exist, and return its digest."""
+def build_test_set(
+    folder: Path,
+    sources: list[Source],
+    config: PackConfig = CONFIG,
+    sensor: SensorConfig = PERFECT,
+    workers: int | None = None,
+) -> str:
+    """Write a test set, but for scenes that exist, and return its digest.
+
+    Raises InputError if the folder cannot be written to or holds a test set of another recipe.
+    """
     from tqdm import tqdm
 
+    _claim(folder, config, sensor)
     numbered = list(enumerate(sources, start=1))
     missing = [item for item in numbered if not (folder / SPLIT / f"{item[0]:06d}").exists()]
     one_thread_a_process()
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        made = [pool.submit(_write_scene, folder, config, *item) for item in missing]
+        made = [pool.submit(_write_scene, folder, config, sensor, *item) for item in missing]
         for future in tqdm(as_completed(made), total=len(made), unit="object", desc=folder.name):
             future.result()
         models = pool.map(_model, [source.path for source in sources])
@@ -54,6 +70,19 @@ def build_test_set(folder: Path, sources: list[Source], config: PackConfig = CON
     frame = BopDataset.open(folder, SPLIT)[0]
     write_camera(folder, frame.camera, finest_depth_scale(float(frame.depth.max()), "mm"))
     return dataset_digest(folder)
+
+
+def _claim(folder: Path, config: PackConfig, sensor: SensorConfig) -> None:
+    """Make the folder, or see that what it holds is of the same recipe; the recipe's file is hidden from digests."""
+    recipe = json.dumps({"config": asdict(config), "sensor": asdict(sensor)}, indent=1) + "\n"
+    file = folder / ".recipe.json"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / SPLIT).exists() and (not file.exists() or file.read_text(encoding="utf-8") != recipe):
+            raise InputError(f"{folder} holds a test set of another recipe: choose another folder, or delete it")
+    except OSError as error:
+        raise InputError(f"{folder} cannot be written to: {error.strerror}") from None
+    write_whole(file, recipe.encode())
 
 
 def verdict(name: str, digest: str) -> str:
@@ -92,11 +121,12 @@ def _model(path: Path) -> ObjectModel:
     return load_object(path).in_unit("m")
 
 
-def _write_scene(folder: Path, config: PackConfig, object_id: int, source: Source) -> None:
+def _write_scene(folder: Path, config: PackConfig, sensor: SensorConfig, object_id: int, source: Source) -> None:
     model = _model(source.path)
     mesh = RayMesh(model.vertices, model.triangles)
     shape = collision_shape(model.vertices, model.triangles, config.hulls)
     scenes, _ = bin_scenes(shape, config, int(model.digest[:8], 16))
-    frames = [exact_frame(mesh, scene, object_id) for scene in scenes]
+    noise = np.random.default_rng((config.seed, object_id)).spawn(len(scenes))
+    frames = [rendered_frame(mesh, scene, object_id, sensor, rng) for scene, rng in zip(scenes, noise, strict=True)]
     farthest = max(float(frame.depth.max()) for frame in frames)
     write_scene(folder, SPLIT, object_id, frames, "m", finest_depth_scale(farthest, "m"))

@@ -18,7 +18,10 @@ from kmn_jax.data.bop import BopDataset
 from kmn_jax.data.mesh_files import read_mesh
 from kmn_jax.data.pack import Pack
 from kmn_jax.data.raycast import RayMesh, render
+from kmn_jax.data.recipe import PackConfig
 from kmn_jax.data.scene import BinScene
+from kmn_jax.data.sensor import SensorConfig
+from kmn_jax.data.views import CameraConfig
 
 ROOT = Path(__file__).parents[1]
 ASSETS = test_sets.ASSETS
@@ -184,6 +187,26 @@ def test_digests_of_the_test_sets_are_recorded_with_what_made_them() -> None:
     assert "differs from test_sets.json" in test_sets.verdict("electronics", "0" * 64)
     if record["made_with"] == test_sets.made_with():
         assert test_sets.verdict("electronics", record["sets"]["electronics"]) == "as recorded"
+
+
+def test_builds_a_test_set_seen_by_a_sensor_and_keeps_recipes_apart(tmp_path: Path) -> None:
+    sources = [source for source in test_sets.industrial_sources() if source.name == "shaft"]
+    config = PackConfig(drops=1, copies=(2, 2), cameras=CameraConfig(width=243, height=150), seed=1)
+    sensor = SensorConfig(noise=0.0015, max_slant=70.0)
+    digests = {
+        name: test_sets.build_test_set(tmp_path / name, sources, config, chosen, workers=1)
+        for name, chosen in (("exact", SensorConfig()), ("sensed", sensor))
+    }
+    exact, sensed = (BopDataset.open(tmp_path / name, "test")[0] for name in digests)
+    both = (exact.depth > 0) & (sensed.depth > 0)
+    assert 0.5 < both.sum() / (exact.depth > 0).sum() < 0.99  # flanks are missing
+    diagonal = float(np.linalg.norm(BopDataset.open(tmp_path / "exact", "test").model(1).size))
+    deviation = np.std((sensed.depth - exact.depth)[both])
+    assert 0.0005 * diagonal < deviation < 0.01 * diagonal
+    assert digests["exact"] != digests["sensed"]
+    assert test_sets.build_test_set(tmp_path / "sensed", sources, config, sensor, workers=1) == digests["sensed"]
+    with pytest.raises(InputError, match="sensed holds a test set of another recipe"):
+        test_sets.build_test_set(tmp_path / "sensed", sources, config, workers=1)
 
 
 def test_shows_pack_and_test_set(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from kmn_jax.data.pack import Drop, PackedObject, quantised
 from kmn_jax.data.physics import BinConfig, DropResult, settle
 from kmn_jax.data.raycast import RayMesh, pack_bits, render, visible_bin_surfels, visible_surfels
 from kmn_jax.data.scene import BinScene
+from kmn_jax.data.sensor import PERFECT, SensorConfig, sense
 from kmn_jax.data.views import CameraConfig, place_camera
 
 
@@ -128,10 +129,16 @@ def visibility_bits(
     )
 
 
-def exact_frame(mesh: RayMesh, scene: BinScene, object_id: int) -> BopFrame:
-    """Render a scene by ray casting, as a frame of a BOP dataset with visible masks, in the scene's unit."""
+def rendered_frame(
+    mesh: RayMesh, scene: BinScene, object_id: int, sensor: SensorConfig, rng: np.random.Generator
+) -> BopFrame:
+    """Render a scene by ray casting, as a frame of a BOP dataset in the scene's unit.
+
+    Masks and visible fractions are exact; the depth is what the sensor makes of it.
+    """
     seen = render(mesh, scene)
-    return scene_frame(scene, object_id, seen.depth, seen.instances, seen.total_pixels, seen.total_boxes)
+    depth = seen.depth if sensor == PERFECT else sense(mesh, scene, seen, sensor, rng)
+    return scene_frame(scene, object_id, depth, seen.instances, seen.total_pixels, seen.total_boxes)
 
 
 def _without_drops(model: ObjectModel, name: str, split: str) -> PackedObject:

@@ -70,6 +70,9 @@ class SensorConfig:
             raise InputError(f"sensor config: projector is {self.projector}, but must be finite")
 
 
+PERFECT = SensorConfig()
+
+
 def sense(
     mesh: RayMesh, scene: BinScene, rendering: Rendering, config: SensorConfig, rng: np.random.Generator
 ) -> Float[np.ndarray, "h w"]:
