@@ -132,6 +132,9 @@ class BopDataset:
         found = [_problem(fault) for fault in self._models[1].values()]
         if (fault := self._camera[1]) is not None:
             found.append(_problem(fault))
+        taken = set(_scene_folders(self.folder / self.split).values())
+        what = "has the scene id of another folder and is passed over: rename it"
+        found += [Problem(path, "", what) for path in _numbered(self.folder / self.split) if path not in taken]
         for scene_id, scene in self._scenes.items():
             found += [_problem(fault, scene_id) for fault in scene.faults]
             for image_id in scene.image_ids:
@@ -172,7 +175,7 @@ class BopDataset:
 
     @cached_property
     def _scenes(self) -> dict[int, Scene]:
-        folders = _scene_folders(self.folder / self.split)
+        folders = dict(sorted(_scene_folders(self.folder / self.split).items()))
         return {scene_id: Scene(path, self.sensor, self.ground_truth) for scene_id, path in folders.items()}
 
     @cached_property
@@ -203,7 +206,10 @@ def _problem(fault: BopFault, scene_id: int | None = None, image_id: int | None 
 
 
 def _scene_folders(folder: Path) -> dict[int, Path]:
+    return {int(path.name): path for path in reversed(_numbered(folder))}
+
+
+def _numbered(folder: Path) -> list[Path]:
     if not folder.is_dir():
-        return {}
-    paths = sorted(path for path in folder.iterdir() if path.name.isascii() and path.name.isdigit() and path.is_dir())
-    return {int(path.name): path for path in paths}
+        return []
+    return sorted(path for path in folder.iterdir() if path.name.isascii() and path.name.isdigit() and path.is_dir())

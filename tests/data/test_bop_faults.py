@@ -310,3 +310,13 @@ def test_sample_json_is_what_other_readers_expect(folder: Path) -> None:
     assert camera["0"]["cam_K"] == [80, 0, 31.5, 0, 82, 23, 0, 0, 1]
     sensor = json.loads((folder / "camera.json").read_text())
     assert sensor == {"cx": 31.5, "cy": 23, "depth_scale": 0.02, "fx": 80, "fy": 82, "height": 48, "width": 64}
+
+
+def test_two_folders_of_one_scene_id(folder: Path) -> None:
+    before = BopDataset.open(folder, "test")
+    shutil.copytree(folder / SCENE, folder / "test" / "0")
+    dataset = BopDataset.open(folder, "test")
+    assert dataset.keys == before.keys
+    assert [problem.file for problem in dataset.problems()] == [folder / "test" / "000000"]
+    assert "has the scene id of another folder" in str(dataset.problems()[0])
+    assert len(dataset.usable()) == len(dataset)
