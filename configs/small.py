@@ -18,7 +18,7 @@ from kmn_jax.train.optimizer import OptimizerConfig
 small = TrainConfig(
     name="small",
     pack="outputs/packs/electronics",
-    num_steps=40_000,
+    num_steps=20_000,
     network=KeyMatchNetConfig(
         num_scene_points=512,
         num_object_points=512,
@@ -29,11 +29,11 @@ small = TrainConfig(
         object_width=64,
         pair_width=128,
         groups=16,
-        dropout=0.1,
+        dropout=0.0,
         inputs="invariant",
         graph="static",
     ),
-    examples=ExampleConfig(crops=CropConfig(num_points=512)),
+    examples=ExampleConfig(crops=CropConfig(num_points=512), random_keypoints=0.3),
     optimizer=OptimizerConfig(
         schedule="cosine",
         learning_rate=1e-3,
@@ -44,7 +44,8 @@ small = TrainConfig(
         clip_norm=1.0,
     ),
     pipeline=PipelineConfig(batch_size=16, crops_per_object=4),
-    average_decay=0.999,
+    crops_at_once=1,
+    average_decay=0.998,
     validate_every=1_000,
     validation_samples=20,
     checkpoint_every=200,

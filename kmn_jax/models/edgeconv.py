@@ -44,10 +44,10 @@ class EdgeConv(nnx.Module):
             z = z + product(pair_features, self.first.kernel[...][2 * self.in_features :], compute)
         affine = self.first.affine(channel_moments(z, edge_mask))
         if self.second is not None:
-            h = leaky_relu(affine(z)).astype(z.dtype)
+            h = affine.activated(z).astype(z.dtype)
             z = product(h, self.second.kernel[...], compute)
             affine = self.second.affine(channel_moments(z, edge_mask))
-        return leaky_relu(affine(z).max(axis=1)).astype(z.dtype)
+        return affine.activated_largest(z, axis=1).astype(z.dtype)
 
     def complete_graph(self, features: Float[Array, "n c"], compute: Compute) -> Float[Array, "n width"]:
         """Return the same for a one-layer block in which every point is a neighbour of every other.

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from kmn_jax.geometry.knn import k_nearest
 from kmn_jax.models.edgeconv import EdgeConv
 from kmn_jax.models.invariants import EncoderInputs
-from kmn_jax.models.layers import Compute, NormalizedLinear, channel_moments, leaky_relu, product
+from kmn_jax.models.layers import Compute, NormalizedLinear, channel_moments, product
 
 Graph = Literal["dynamic", "static"]
 
@@ -80,11 +80,9 @@ class Encoder(nnx.Module):
     ) -> Float[Array, "n out"]:
         """Return the layer on [global ; local]: the global part is one vector, so it is multiplied once."""
         z = product(local, self.embedding.kernel[...], compute)
-        activation = self.embedding.affine(channel_moments(z, mask))(z)
-        if mask is not None:
-            activation = jnp.where(mask[:, None], activation, -jnp.inf)
-        overall = leaky_relu(activation.max(axis=0)).astype(z.dtype)
+        affine = self.embedding.affine(channel_moments(z, mask))
+        overall = affine.activated_largest(z, 0, mask).astype(z.dtype)
         kernel = self.out.kernel[...]
         width = overall.shape[0]
         z = product(local, kernel[width:], compute) + product(overall[None, :], kernel[:width], compute)
-        return leaky_relu(self.out.affine(channel_moments(z, mask))(z)).astype(z.dtype)
+        return self.out.affine(channel_moments(z, mask)).activated(z).astype(z.dtype)

@@ -24,7 +24,7 @@ class TrainConfig:
     loss: LossConfig = field(default_factory=LossConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
-    groups_at_once: int | None = None  # objects that are computed side by side; None: all of a batch
+    crops_at_once: int | None = None  # that a device computes side by side; None: all of its share of a batch
     average_decay: float = 0.0  # of the running mean of the parameters that is evaluated and shipped; 0: the last ones
     seed: int = 0
     training_share: float = 1.0  # of the pack's training objects, spread evenly over its list
@@ -48,11 +48,10 @@ class TrainConfig:
                 f"validation_samples = {self.validation_samples} must be a multiple of pipeline.crops_per_object ="
                 f" {self.pipeline.crops_per_object}"
             )
-        groups = self.pipeline.groups_per_batch
-        if self.groups_at_once is not None and (self.groups_at_once < 1 or groups % self.groups_at_once):
+        each, at_once = self.pipeline.crops_per_object, self.crops_at_once
+        if at_once is not None and (at_once < 1 or (each % at_once and at_once % each)):
             raise InputError(
-                f"groups_at_once = {self.groups_at_once} must divide the {groups} groups of a batch:"
-                f" batch_size = {self.pipeline.batch_size} over crops_per_object = {self.pipeline.crops_per_object}"
+                f"crops_at_once = {at_once} must divide pipeline.crops_per_object = {each}, or be a multiple of it"
             )
         if self.examples.crops.num_points != self.network.num_scene_points:
             raise InputError(
@@ -69,7 +68,7 @@ class TrainConfig:
             examples=self.examples,
             loss=self.loss,
             crops_per_object=self.pipeline.crops_per_object,
-            groups_at_once=self.groups_at_once,
+            crops_at_once=self.crops_at_once,
             average_decay=self.average_decay,
             seed=self.seed,
         )

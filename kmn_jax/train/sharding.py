@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any, TypeVar
 
@@ -70,12 +69,13 @@ def data_mesh(devices: Sequence[jax.Device] | None = None) -> Mesh:
 
 
 def check_batch(size: int, config: StepConfig, mesh: Mesh) -> None:
-    """Raise InputError unless every device gets whole groups of what is computed side by side."""
-    at_once = config.groups_at_once or size // config.crops_per_object
-    if at_once % mesh.size:
+    """Raise InputError unless every device gets whole chunks of what it computes side by side."""
+    unit = max(config.crops_per_object, config.crops_at_once or 1)
+    if size % (unit * mesh.size):
         raise InputError(
-            f"a batch of {size} in groups of {config.crops_per_object} crops of one object, {at_once} at once, cannot"
-            f" be shared by {mesh.size} devices: choose batch_size and groups_at_once so that they divide"
+            f"a batch of {size}, in groups of {config.crops_per_object} crops of one object, cannot be shared by"
+            f" {mesh.size} devices that take {unit} at once: choose a batch_size that is a multiple of"
+            f" {unit * mesh.size}"
         )
 
 
@@ -95,7 +95,7 @@ def jit_train_step(
 
     whole, shared = _shardings(mesh)
     return jax.jit(
-        partial(train_step, graphdef, optimizer.build(num_steps), _share(config, mesh), spread=spread),
+        partial(train_step, graphdef, optimizer.build(num_steps), config, spread=spread),
         in_shardings=(whole, whole, shared, whole),
         out_shardings=whole,
         donate_argnums=0,
@@ -107,16 +107,11 @@ def jit_eval_step(graphdef: nnx.GraphDef, config: StepConfig, mesh: Mesh) -> Eva
     """Return `eval_step` of parameters, pack and batch, compiled for the mesh."""
 
     def summed(*arguments: Any) -> Sums:
-        return jax.lax.psum(eval_step(graphdef, _share(config, mesh), *arguments), _AXIS)
+        return jax.lax.psum(eval_step(graphdef, config, *arguments), _AXIS)
 
     whole, shared = _shardings(mesh)
     step = jax.shard_map(summed, mesh=mesh, in_specs=(_WHOLE, _WHOLE, _SHARED), out_specs=_WHOLE, check_vma=False)
     return jax.jit(step, in_shardings=(whole, whole, shared), out_shardings=whole)
-
-
-def _share(config: StepConfig, mesh: Mesh) -> StepConfig:
-    """Return what one device computes: its part of the groups that are computed side by side."""
-    return replace(config, groups_at_once=config.groups_at_once and config.groups_at_once // mesh.size)
 
 
 def put_whole(tree: _T, mesh: Mesh) -> _T:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ class StepConfig:
     examples: ExampleConfig
     loss: LossConfig
     crops_per_object: int  # consecutive samples of a batch that share an object, and its encoding
-    groups_at_once: int | None  # groups that are computed side by side, the rest one after the other; None: all
+    crops_at_once: int | None  # that a device computes side by side, the rest one after the other; None: all
     average_decay: float  # of the running mean of the parameters, which is what is evaluated and shipped
     seed: int
 
@@ -73,6 +73,9 @@ class Sums(NamedTuple):
     object_points: Float[Array, ""]
     num_crops: Float[Array, ""]
 
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
 
 # Parameters, pack, batch and a dropout key for each of its groups -> gradient and sums.
 SumGradients: TypeAlias = Callable[[nnx.State, DevicePack, SampleIndex, Array], tuple[nnx.State, Sums]]
@@ -129,23 +132,33 @@ def sum_gradients(
     index: SampleIndex,
     dropout: Key[Array, " groups"],
 ) -> tuple[nnx.State, Sums]:
-    """Return the gradient of the summed loss of a batch, and the sums, with one dropout key for each group."""
+    """Return the gradient of the summed loss of a batch, and the sums, with one dropout key for each group.
 
-    def summed(parameters: nnx.State, chunk: _Chunk) -> tuple[Float[Array, ""], Sums]:
-        sums = _chunk_sums(graphdef, parameters, config, pack, chunk)
-        return sums.loss, sums
+    Gradients are summed up part by part, in both directions before the next one: nothing of a part need be kept, and
+    its arrays stay in a CPU's cache.
+    """
 
-    gradient = jax.grad(summed, has_aux=True)
-    chunks = _chunks(index, dropout, config)
-    if jax.tree.leaves(chunks)[0].shape[0] == 1:
-        only: tuple[nnx.State, Sums] = gradient(parameters, jax.tree.map(lambda leaf: leaf[0], chunks))
-        return only
+    def of_chunk(chunk: _Chunk) -> tuple[nnx.State, Sums]:
+        groups = _make(pack, chunk, config, config.examples)
+        object_keys, crop_keys = _dropout_keys(chunk.dropout, config.crops_per_object)
 
-    def add(carry: tuple[nnx.State, Sums], chunk: _Chunk) -> tuple[tuple[nnx.State, Sums], None]:
-        return jax.tree.map(jnp.add, carry, gradient(parameters, chunk)), None
+        def encode(parameters: nnx.State) -> Float[Array, "c k o"]:
+            return _encode_objects(graphdef, parameters, groups, object_keys)
 
-    zeros = (jax.tree.map(jnp.zeros_like, parameters), Sums(*(jnp.float32(0),) * len(Sums._fields)))
-    return jax.lax.scan(add, zeros, chunks)[0]
+        def summed(
+            parameters: nnx.State, features: Float[Array, "c k o"], part: _Part
+        ) -> tuple[Float[Array, ""], Sums]:
+            sums = _part_sums(graphdef, parameters, config.loss, features, groups.length, part)
+            return sums.loss, sums
+
+        features, pull = jax.vjp(encode, parameters)
+        gradient = jax.grad(summed, argnums=(0, 1), has_aux=True)
+        (own, of_features), sums = _summed(
+            lambda part: gradient(parameters, features, part), _parts(groups, chunk, crop_keys, config)
+        )
+        return jax.tree.map(jnp.add, own, pull(of_features)[0]), sums
+
+    return _summed(of_chunk, _chunks(index, dropout, config))
 
 
 def eval_step(
@@ -155,9 +168,16 @@ def eval_step(
 
     Sums of several batches are added; `mean_metrics` makes means of them.
     """
-    chunks = _chunks(index, None, config)
-    sums = jax.lax.map(lambda chunk: _chunk_sums(graphdef, parameters, config, pack, chunk, False), chunks)
-    return jax.tree.map(lambda leaf: leaf.sum(), sums)
+
+    def of_chunk(chunk: _Chunk) -> Sums:
+        groups = _make(pack, chunk, config, config.examples.plain())
+        features = _encode_objects(graphdef, parameters, groups, None)
+        return _summed(
+            lambda part: _part_sums(graphdef, parameters, config.loss, features, groups.length, part),
+            _parts(groups, chunk, None, config),
+        )
+
+    return _summed(of_chunk, _chunks(index, None, config))
 
 
 class _Chunk(NamedTuple):
@@ -170,65 +190,114 @@ class _Chunk(NamedTuple):
     dropout: PRNGKey | None
 
 
+class _Part(NamedTuple):
+    """Crops that are computed side by side: p of each of c groups."""
+
+    crops: Float[Array, "c p n 6"]
+    mask: Bool[Array, "c p n"]
+    is_object: Bool[Array, "c p n"]
+    keypoint: Int[Array, "c p n"]
+    weight: Float[Array, "c p"]
+    dropout: PRNGKey | None
+
+
 def _chunks(index: SampleIndex, dropout: Key[Array, " groups"] | None, config: StepConfig) -> _Chunk:
     """Split a batch into groups, and those into chunks along a new first axis."""
-    size = index.object.shape[0]
-    groups = size // config.crops_per_object
-    at_once = config.groups_at_once or groups
-    if size % config.crops_per_object or groups % at_once:
-        raise InputError(
-            f"a batch of {size} must hold whole chunks of {at_once} groups of crops_per_object ="
-            f" {config.crops_per_object}"
-        )
-    shape = (groups // at_once, at_once, config.crops_per_object)
+    size, each = index.object.shape[0], config.crops_per_object
+    groups = size // each
+    at_once = max(1, config.crops_at_once // each) if config.crops_at_once else groups
+    if size % each or groups % at_once:
+        raise InputError(f"a batch of {size} must hold whole chunks of {at_once} groups of crops_per_object = {each}")
+    shape = (groups // at_once, at_once, each)
     rows, drops, counted = (jnp.asarray(array).reshape(shape) for array in (index.object, index.drop, index.mask))
     keys = jnp.asarray(index.key).reshape(*shape, 2)
     return _Chunk(rows[..., 0], drops, keys, counted, None if dropout is None else dropout.reshape(shape[:2]))
 
 
-def _chunk_sums(
-    graphdef: nnx.GraphDef,
-    parameters: nnx.State,
-    config: StepConfig,
-    pack: DevicePack,
-    chunk: _Chunk,
-    train: bool = True,
-) -> Sums:
-    network = nnx.merge(graphdef, parameters)
-    examples = config.examples if train else config.examples.plain()
-    groups = jax.lax.stop_gradient(
+def _make(pack: DevicePack, chunk: _Chunk, config: StepConfig, examples: ExampleConfig) -> Group:
+    """Make the examples of a chunk."""
+    return jax.lax.stop_gradient(
         jax.vmap(lambda row, drops, keys: make_group(pack, row, drops, keys, config.network, examples))(
             chunk.row, chunk.drops, chunk.keys
         )
     )
 
-    def losses(group: Group, key: PRNGKey | None) -> MatchingLoss:
-        object_key, crops_key = (None, None) if key is None else jax.random.split(key)
-        features = network.encode_object(group.cloud, group.keypoint_indices, group.length, object_key)
-        keys = None if crops_key is None else jax.random.split(crops_key, group.crops.shape[0])
 
-        def one(crop, mask, is_object, keypoint, head_key):  # type: ignore[no-untyped-def]
-            scene = network.encode_scene(crop, group.length, mask)
-            segmentation, keypoints = network.match(scene, features, mask, head_key)
-            return matching_loss(segmentation, keypoints, is_object, keypoint, mask, config.loss)
+def _dropout_keys(
+    keys: Key[Array, " c"] | None, crops: int
+) -> tuple[Key[Array, " c"] | None, Key[Array, "c g"] | None]:
+    """Return a key for each group's object and for each of its crops."""
+    if keys is None:
+        return None, None
+    pairs = jax.vmap(jax.random.split)(keys)
+    return pairs[:, 0], jax.vmap(lambda key: jax.random.split(key, crops))(pairs[:, 1])
 
-        return jax.vmap(one)(group.crops, group.mask, group.is_object, group.keypoint, keys)
 
-    result = jax.vmap(losses)(groups, chunk.dropout)
+def _parts(groups: Group, chunk: _Chunk, keys: Key[Array, "c g"] | None, config: StepConfig) -> _Part:
+    """Split the crops of a chunk's groups into parts along a new first axis."""
+    each = config.crops_per_object
+    at_once = min(config.crops_at_once or each, each)
     weight = (groups.valid & chunk.counted).astype(jnp.float32)
+    whole = _Part(groups.crops, groups.mask, groups.is_object, groups.keypoint, weight, keys)
+
+    def split(array: Array) -> Array:
+        return jnp.moveaxis(array.reshape(array.shape[0], each // at_once, at_once, *array.shape[2:]), 1, 0)
+
+    return jax.tree.map(split, whole)
+
+
+def _encode_objects(
+    graphdef: nnx.GraphDef, parameters: nnx.State, groups: Group, keys: Key[Array, " c"] | None
+) -> Float[Array, "c k o"]:
+    network = nnx.merge(graphdef, parameters)
+    return jax.vmap(network.encode_object)(groups.cloud, groups.keypoint_indices, groups.length, keys)
+
+
+def _part_sums(
+    graphdef: nnx.GraphDef,
+    parameters: nnx.State,
+    config: LossConfig,
+    features: Float[Array, "c k o"],
+    lengths: Float[Array, " c"],
+    part: _Part,
+) -> Sums:
+    network = nnx.merge(graphdef, parameters)
+
+    def of_group(features: Float[Array, "k o"], length: Float[Array, ""], part: _Part) -> MatchingLoss:
+        def one(crop, mask, is_object, keypoint, key):  # type: ignore[no-untyped-def]
+            scene = network.encode_scene(crop, length, mask)
+            segmentation, keypoints = network.match(scene, features, mask, key)
+            return matching_loss(segmentation, keypoints, is_object, keypoint, mask, config)
+
+        return jax.vmap(one)(part.crops, part.mask, part.is_object, part.keypoint, part.dropout)
+
+    result = jax.vmap(of_group)(features, lengths, part)
     points, object_points = (
-        weight * count.astype(jnp.float32) for count in (result.num_points, result.num_object_points)
+        part.weight * count.astype(jnp.float32) for count in (result.num_points, result.num_object_points)
     )
     return Sums(
-        loss=(weight * result.total).sum(),
-        segmentation_loss=(weight * result.segmentation).sum(),
-        keypoint_loss=(weight * result.keypoint).sum(),
+        loss=(part.weight * result.total).sum(),
+        segmentation_loss=(part.weight * result.segmentation).sum(),
+        keypoint_loss=(part.weight * result.keypoint).sum(),
         segmentation_right=(points * result.segmentation_accuracy).sum(),
         keypoint_right=(object_points * result.keypoint_accuracy).sum(),
         points=points.sum(),
         object_points=object_points.sum(),
-        num_crops=weight.sum(),
+        num_crops=part.weight.sum(),
     )
+
+
+def _summed(function: Callable[[_Item], _Result], items: _Item) -> _Result:
+    """Return the sum of what a function gives for each entry along the items' first axis, one after the other."""
+    first = jax.tree.map(lambda leaf: leaf[0], items)
+    if jax.tree.leaves(items)[0].shape[0] == 1:
+        return function(first)
+
+    def add(total: _Result, item: _Item) -> tuple[_Result, None]:
+        return jax.tree.map(jnp.add, total, function(item)), None
+
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, first))
+    return jax.lax.scan(add, zeros, items)[0]
 
 
 def mean_metrics(sums: Sums) -> Metrics:
