@@ -18,7 +18,7 @@ from configs import CONFIGS, find_config
 from kmn_jax.checks import InputError
 from kmn_jax.train.config import TrainConfig
 from kmn_jax.train.loop import NotFiniteError, train
-from kmn_jax.train.sharding import initialize_distributed
+from kmn_jax.train.sharding import initialize_distributed, split_cpu
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,8 @@ def main(arguments: list[str] | None = None) -> int:
             return 0 if name in ("-h", "--help") else 2
         options = _parse(name, rest)
         folder = options.folder or Path("runs") / name
+        if not options.processes:
+            split_cpu(options.config.pipeline.groups_per_batch)
         initialize_distributed(options.coordinator, options.processes, options.process)
         outcome = train(
             options.config,
