@@ -33,7 +33,7 @@ small = TrainConfig(
         inputs="invariant",
         graph="static",
     ),
-    examples=ExampleConfig(crops=CropConfig(num_points=512), random_keypoints=0.3),
+    examples=ExampleConfig(crops=CropConfig(num_points=512), crops_per_scene=2, random_keypoints=0.3),
     optimizer=OptimizerConfig(
         schedule="cosine",
         learning_rate=1e-3,

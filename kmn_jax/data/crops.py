@@ -17,6 +17,7 @@ from kmn_jax.typing import Pose, PRNGKey, Scalar
 NormalSource = Literal["estimated", "surface"]
 
 _MOST_SIGMAS = 3.0  # noise is clipped there, as published
+_TINY = 1e-30  # keeps sums of nothing from dividing by zero
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class CropConfig:
     """Choose what a crop holds; lengths are shares of the object's diameter.
 
     Normals are those of the CAD "surface", or "estimated" from noisy points as by a sensor, which has more points than
-    a crop keeps: `normal_points` are drawn, those within `normal_radius` define a plane, and the first `num_points` are
+    a crop keeps: `normal_points` are drawn, those within `normal_radius` define a plane, and `num_points` of them are
     the crop. (By the 16 nearest of a crop's own 512 points, the median normal would be off by about 20 degrees.)
     """
 
@@ -55,7 +56,7 @@ class CropConfig:
 
     @property
     def num_drawn(self) -> int:
-        """The number of points to draw, of which the first `num_points` are the crop."""
+        """The number of points to draw, of which `num_points` are the crop."""
         return self.num_points if self.normals == "surface" else max(self.num_points, self.normal_points)
 
 
@@ -96,20 +97,14 @@ def draw_crop(
     if total < 1:
         raise ValueError("visible holds no points: a scene needs at least one copy and one surfel")
     seed_key, draw_key, sigma_key, noise_key = jax.random.split(key, 4)
-    weights = jnp.log(jnp.where(visible.mask, visible.picture_area, 0))  # minus infinity: never drawn
+    weights = jnp.where(visible.mask, visible.picture_area, 0)
     seed_row, found = _draw_seed(seed_key, visible, weights, config.min_visible_fraction)
 
     x, y, z = (visible.points[:, axis] - visible.points[seed_row, axis] for axis in range(3))
-    inside = found & (weights > -jnp.inf) & (x**2 + y**2 + z**2 <= (config.radius * diameter) ** 2)
+    inside = found & (weights > 0) & (x**2 + y**2 + z**2 <= (config.radius * diameter) ** 2)
     if not config.include_bin:
         inside = inside & (visible.instance != BIN)
-    # Gumbel numbers on log weights: the largest sums are a weighted draw without replacement, in the order of drawing.
-    ranks = jnp.where(inside, weights, -jnp.inf) + jax.random.gumbel(draw_key, (total,))
-    ranks = ranks.at[seed_row].set(jnp.where(found, jnp.inf, -jnp.inf))
-    # Without the barrier XLA merges later slices into the selection, which then falls back to a full sort.
-    # (One for each of the two: under shard_map XLA fails on one for both.)
-    top, rows = map(jax.lax.optimization_barrier, jax.lax.top_k(ranks, min(config.num_drawn, total)))
-    drawn = top > -jnp.inf
+    rows, drawn, kept = _draw_rows(draw_key, jnp.where(inside, weights, 0), seed_row, found, config)
 
     exact = jnp.where(drawn[:, None], visible.points[rows], 0)
     sigma = config.max_noise * diameter * jax.random.uniform(sigma_key)
@@ -117,7 +112,8 @@ def draw_crop(
     seed = jnp.where(found, noisy[0], 0)
     noisy = jnp.where(drawn[:, None], noisy - seed[None], 0)
 
-    rows, mask, exact, points = (part[: config.num_points] for part in (rows, drawn, exact, noisy))
+    mask = drawn[: kept.shape[0]]
+    rows, exact, points = rows[kept], exact[kept], noisy[kept]
     if config.normals == "surface":
         normals, known = visible.normals[rows], mask
     else:
@@ -154,9 +150,49 @@ def _draw_seed(
     """Return the row of a random point on a copy of which enough is visible, and whether there is one."""
     on_copy = visible.instance != BIN
     enough = (visible.visible_fraction >= min_visible_fraction)[jnp.where(on_copy, visible.instance, 0)]
-    ranks = jnp.where(on_copy & enough, weights, -jnp.inf) + jax.random.gumbel(key, weights.shape)
-    row = jnp.argmax(ranks)
-    return row, ranks[row] > -jnp.inf
+    weights = jnp.where(on_copy & enough, weights, 0)
+    # In whole numbers, whose running sums never fall and are exact.
+    ends = jnp.cumsum((weights * (2.0**30 / jnp.maximum(weights.sum(), _TINY))).astype(jnp.int32))
+    place = jax.random.randint(key, (), 0, jnp.maximum(ends[-1], 1))
+    row = jnp.searchsorted(ends, place, side="right")
+    return jnp.minimum(row, ends.shape[0] - 1), ends[-1] > 0
+
+
+def _draw_rows(
+    key: PRNGKey, weights: Float[Array, " r"], seed_row: Int[Array, ""], found: Bool[Array, ""], config: CropConfig
+) -> tuple[Int[Array, " drawn"], Bool[Array, " drawn"], Int[Array, " n"]]:
+    """Return rows to draw, the seed's first; which of them there are, all in front; and which become the crop.
+
+    A systematic draw without replacement: rows lie side by side, each as long as it is likely, and one point in every
+    unit of length, all at one random distance from its beginning, names a row. Of those the crop takes one at random
+    from each of as many equal stretches as it has points.
+    """
+    start_key, stretch_key = jax.random.split(key)
+    others = min(config.num_drawn, weights.shape[0]) - 1
+    likely = _likelihoods(weights.at[seed_row].set(0), others)
+    unit = min(2**16, 2**30 // max(others, 1))
+    ends = jnp.cumsum((likely * unit).astype(jnp.int32))
+    places = jax.random.randint(start_key, (), 0, unit) + unit * jnp.arange(others, dtype=jnp.int32)
+    rows = jnp.minimum(jnp.searchsorted(ends, places, side="right"), weights.shape[0] - 1).astype(jnp.int32)
+    rows = jnp.concatenate([seed_row[None].astype(jnp.int32), rows])
+    drawn = jnp.concatenate([found[None], places < ends[-1]])
+
+    count, total = min(config.num_points - 1, others), (places < ends[-1]).sum(dtype=jnp.int32)
+    order = jnp.arange(count, dtype=jnp.int32)
+    low, high = order * total // max(count, 1), (order + 1) * total // max(count, 1)
+    chosen = jnp.where(total > count, jax.random.randint(stretch_key, (count,), low, jnp.maximum(high, low + 1)), order)
+    return rows, drawn, jnp.concatenate([jnp.zeros(1, dtype=jnp.int32), 1 + chosen])
+
+
+def _likelihoods(weights: Float[Array, " r"], count: int) -> Float[Array, " r"]:
+    """Return how likely each row is drawn: in proportion to its weight, at most 1, about `count` in sum."""
+    scale = count / jnp.maximum(weights.sum(), _TINY)
+    for _ in range(3):  # what one row cannot have falls to the others
+        full = weights * scale >= 1
+        rest = jnp.maximum(jnp.where(full, 0, weights).sum(), _TINY)
+        scale = jnp.maximum(scale, (count - full.sum(dtype=jnp.float32)) / rest)
+    some = weights > 0
+    return jnp.where(some, jnp.where(some.sum() <= count, 1, jnp.minimum(weights * scale, 1)), 0)
 
 
 def _unit(vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:

@@ -211,7 +211,12 @@ def _place(surfels: Surfels, T_camera_object: Float[Array, "c 4 4"], copies: Boo
     pose = jnp.where(copies[:, None, None], T_camera_object.astype(jnp.float32), jnp.eye(4)[None])
 
     def rotated(vectors: Float[Array, "m 3"]) -> list[Float[Array, " r"]]:
-        rows = jnp.einsum("cij,mj->icm", pose[:, :3, :3], vectors, precision=jax.lax.Precision.HIGHEST)
+        # Not as a product of matrices: what follows is computed with it in one go.
+        columns = vectors.T[:, None, :]
+        rows = [
+            sum((pose[:, i, j, None] * columns[j] for j in range(1, 3)), pose[:, i, 0, None] * columns[0])
+            for i in range(3)
+        ]
         return [row.reshape(-1) for row in rows]
 
     shift = [jnp.repeat(pose[:, i, 3], m) for i in range(3)]

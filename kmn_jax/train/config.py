@@ -53,6 +53,11 @@ class TrainConfig:
             raise InputError(
                 f"crops_at_once = {at_once} must divide pipeline.crops_per_object = {each}, or be a multiple of it"
             )
+        if each % self.examples.crops_per_scene:
+            raise InputError(
+                f"examples.crops_per_scene = {self.examples.crops_per_scene} must divide pipeline.crops_per_object ="
+                f" {each}"
+            )
         if self.examples.crops.num_points != self.network.num_scene_points:
             raise InputError(
                 f"examples.crops.num_points = {self.examples.crops.num_points} and network.num_scene_points ="

@@ -30,6 +30,7 @@ class ExampleConfig:
     crops: CropConfig = field(default_factory=CropConfig)
     visibility: Literal["bits", "splat"] = "bits"  # of the pack's views, or found anew for them in the step
     splat: SplatConfig = field(default_factory=SplatConfig)
+    crops_per_scene: int = 1  # crops of an object that come from the first one's scene: finding what is seen costs most
     random_keypoints: float = 0.6  # share of examples whose keypoints are random points, not farthest ones
     rotate_object: bool = True
     object_shift: float = 0.1  # at most, in any direction
@@ -38,6 +39,8 @@ class ExampleConfig:
     def __post_init__(self) -> None:
         if self.visibility not in ("bits", "splat"):
             raise InputError(f'visibility is {self.visibility!r}, but must be "bits" or "splat"')
+        if self.crops_per_scene < 1:
+            raise InputError(f"crops_per_scene = {self.crops_per_scene} must be at least 1")
         if not 0 <= self.random_keypoints <= 1:
             raise InputError(f"random_keypoints = {self.random_keypoints} is a share: it must be between 0 and 1")
         if self.object_shift < 0 or self.object_noise < 0:
@@ -50,6 +53,7 @@ class ExampleConfig:
         return replace(
             self,
             crops=replace(self.crops, max_noise=0.0),
+            crops_per_scene=1,
             random_keypoints=0.0,
             rotate_object=False,
             object_shift=0.0,
@@ -95,15 +99,21 @@ def make_group(
     indices = _keypoints(jax.random.fold_in(object_key, 1), points / diameter, network.num_keypoints, config)
     keypoints = points[indices]
 
-    def crop(drop: Int[Array, ""], key: UInt32[Array, " 2"]) -> tuple[Array, ...]:
+    def of_scene(drop: Int[Array, ""], keys: UInt32[Array, "s 2"]) -> tuple[Array, ...]:
         scene = take_scene(pack, row, drop)
         visible = visible_points(scene, config.splat if config.visibility == "splat" else None)
-        crop_key = jax.random.fold_in(jax.random.wrap_key_data(key), 0)
-        made = draw_crop(crop_key, visible, keypoints, scene.T_camera_object, diameter, config.crops)
-        cloud = jnp.concatenate([made.points, made.normals], axis=1)
-        return cloud, made.mask, made.is_object, made.keypoint, made.valid
 
-    crops = jax.lax.map(lambda pair: crop(*pair), (drops, keys))
+        def crop(key: UInt32[Array, " 2"]) -> tuple[Array, ...]:
+            crop_key = jax.random.fold_in(jax.random.wrap_key_data(key), 0)
+            made = draw_crop(crop_key, visible, keypoints, scene.T_camera_object, diameter, config.crops)
+            cloud = jnp.concatenate([made.points, made.normals], axis=1)
+            return cloud, made.mask, made.is_object, made.keypoint, made.valid
+
+        return jax.lax.map(crop, keys)
+
+    each = config.crops_per_scene
+    scenes = jax.lax.map(lambda pair: of_scene(*pair), (drops[::each], keys.reshape(-1, each, 2)))
+    crops = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), scenes)
     cloud = _augmented(jax.random.fold_in(object_key, 2), points, normals, diameter, config)
     return Group(cloud, indices, config.crops.radius * diameter, *crops)
 
