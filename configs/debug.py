@@ -35,7 +35,7 @@ debug = TrainConfig(
         graph="static",
     ),
     examples=ExampleConfig(crops=CropConfig(num_points=128, normal_points=512)),
-    optimizer=OptimizerConfig(schedule="cosine", learning_rate=3e-3, warmup_steps=5, decoupled=True),
+    optimizer=OptimizerConfig(method="adamw", schedule="cosine", learning_rate=3e-3, warmup_steps=5),
     pipeline=PipelineConfig(batch_size=8, crops_per_object=2),
     average_decay=0.9,
     validate_every=20,

@@ -18,7 +18,7 @@ from kmn_jax.train.optimizer import OptimizerConfig
 small = TrainConfig(
     name="small",
     pack="outputs/packs/electronics",
-    num_steps=20_000,
+    num_steps=15_000,
     network=KeyMatchNetConfig(
         num_scene_points=512,
         num_object_points=512,
@@ -35,12 +35,12 @@ small = TrainConfig(
     ),
     examples=ExampleConfig(crops=CropConfig(num_points=512), crops_per_scene=2, random_keypoints=0.3),
     optimizer=OptimizerConfig(
+        method="muon",
         schedule="cosine",
-        learning_rate=1e-3,
-        least_rate=1e-5,
-        warmup_steps=500,
-        weight_decay=0.01,
-        decoupled=True,
+        learning_rate=3e-2,
+        least_rate=1e-4,
+        warmup_steps=200,
+        weight_decay=0.0,
         clip_norm=1.0,
     ),
     pipeline=PipelineConfig(batch_size=16, crops_per_object=4),

@@ -13,7 +13,7 @@ from kmn_jax.checks import InputError
 from kmn_jax.data.crops import CropConfig, draw_crop
 from kmn_jax.data.device_pack import DevicePack, take_scene, visible_points
 from kmn_jax.data.splat import SplatConfig
-from kmn_jax.geometry import farthest_point_indices, random_rotation
+from kmn_jax.geometry import farthest_point_indices, nearest, random_rotation, transform_points
 from kmn_jax.models import KeyMatchNetConfig
 from kmn_jax.typing import PRNGKey
 
@@ -61,6 +61,17 @@ class ExampleConfig:
         )
 
 
+class RenderedCrops(NamedTuple):
+    """Crops that were made before, of depth images, with a leading axis for each sample; lengths in metres."""
+
+    points: Float[Array, "... n 3"]
+    normals: Float[Array, "... n 3"]
+    mask: Bool[Array, "... n"]
+    is_object: Bool[Array, "... n"]
+    T_crop_object: Float[Array, "... 4 4"]
+    valid: Bool[Array, "..."]
+
+
 class Group(NamedTuple):
     """One object and g crops of bins of it, in the pack's unit."""
 
@@ -81,8 +92,11 @@ def make_group(
     keys: UInt32[Array, "g 2"],
     network: KeyMatchNetConfig,
     config: ExampleConfig,
+    rendered: RenderedCrops | None = None,
 ) -> Group:
     """Make the examples of one object. Each crop is a function of its key, the object's cloud of the first one.
+
+    With `rendered` crops there are no scenes: only the object's cloud, its keypoints and the labels are made.
 
     Raises InputError if the pack has fewer surfels than the network's object cloud has points.
     """
@@ -111,11 +125,16 @@ def make_group(
 
         return jax.lax.map(crop, keys)
 
+    cloud = _augmented(jax.random.fold_in(object_key, 2), points, normals, diameter, config)
+    length = config.crops.radius * diameter
+    if rendered is not None:
+        crops = jnp.concatenate([rendered.points, rendered.normals], axis=2)
+        labels = jax.vmap(lambda points, pose: nearest(points, transform_points(pose, keypoints))[0])
+        keypoint = labels(rendered.points, rendered.T_crop_object).astype(jnp.int32)
+        return Group(cloud, indices, length, crops, rendered.mask, rendered.is_object, keypoint, rendered.valid)
     each = config.crops_per_scene
     scenes = jax.lax.map(lambda pair: of_scene(*pair), (drops[::each], keys.reshape(-1, each, 2)))
-    crops = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), scenes)
-    cloud = _augmented(jax.random.fold_in(object_key, 2), points, normals, diameter, config)
-    return Group(cloud, indices, config.crops.radius * diameter, *crops)
+    return Group(cloud, indices, length, *(leaf.reshape(-1, *leaf.shape[2:]) for leaf in scenes))
 
 
 def _cloud_rows(key: PRNGKey, total: int, count: int, config: ExampleConfig) -> Int[Array, " count"]:

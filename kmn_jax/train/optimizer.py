@@ -12,18 +12,22 @@ from jaxtyping import Float32
 
 from kmn_jax.checks import InputError
 
+_VECTOR_RATE = 0.1  # of Adam for vectors beside Muon for matrices
+
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Adam and its learning rate; the defaults are the published ones, with an epoch's steps filled in by the config.
+    """How parameters change, and how fast; the defaults are the published ones, with an epoch's steps from the config.
 
     Attributes:
         schedule: "step" multiplies the rate by `decay` every `decay_steps`, down to `least_rate`; "cosine" warms up
             linearly over `warmup_steps`, then falls to `least_rate` at the last step.
-        decoupled: weight decay beside the gradient (AdamW) instead of in it, as published.
+        method: "adam" has the weight decay in the gradient, as published, "adamw" beside it. "muon" makes the updates
+            of matrices orthogonal (K. Jordan et al., 2024); those of vectors are by AdamW at a tenth of the rate.
         clip_norm: gradients are scaled down to this global norm; 0 leaves them.
     """
 
+    method: Literal["adam", "adamw", "muon"] = "adam"
     schedule: Literal["step", "cosine"] = "step"
     learning_rate: float = 1e-4
     least_rate: float = 1e-5
@@ -31,11 +35,12 @@ class OptimizerConfig:
     decay: float = 0.7
     decay_steps: int = 20 * 232_000 // 14
     weight_decay: float = 1e-4
-    decoupled: bool = False
     beta2: float = 0.999
     clip_norm: float = 0.0
 
     def __post_init__(self) -> None:
+        if self.method not in ("adam", "adamw", "muon"):
+            raise InputError(f'method is {self.method!r}, but must be "adam", "adamw" or "muon"')
         if self.schedule not in ("step", "cosine"):
             raise InputError(f'schedule is {self.schedule!r}, but must be "step" or "cosine"')
         if not 0 < self.least_rate <= self.learning_rate:
@@ -80,12 +85,21 @@ class OptimizerConfig:
         """Return the optimizer of a run of so many steps."""
         rate = self.rate(num_steps)
         clip = [optax.clip_by_global_norm(self.clip_norm)] if self.clip_norm else []
-        if self.decoupled:
-            adam = [optax.adamw(rate, b2=self.beta2, weight_decay=self.weight_decay)]
-        else:
+        if self.method == "adam":
             decay = [optax.add_decayed_weights(self.weight_decay)] if self.weight_decay else []
-            adam = [*decay, optax.adam(rate, b2=self.beta2)]
-        chain = optax.chain(*clip, *adam)
+            method = [*decay, optax.adam(rate, b2=self.beta2)]
+        elif self.method == "adamw":
+            method = [optax.adamw(rate, b2=self.beta2, weight_decay=self.weight_decay)]
+        else:
+            from optax import contrib
+
+            def vectors(count: Any) -> Any:
+                return _VECTOR_RATE * rate(count)
+
+            method = [
+                contrib.muon(rate, weight_decay=self.weight_decay, adam_b2=self.beta2, adam_learning_rate=vectors)
+            ]
+        chain = optax.chain(*clip, *method)
 
         def update(grads: Any, state: Any, parameters: Any = None) -> Any:
             # optax itself mixes dtypes and ranks, also where JAX is told to refuse that.

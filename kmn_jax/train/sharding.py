@@ -20,12 +20,11 @@ from jaxtyping import Array, Int
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.device_pack import DevicePack
-from kmn_jax.data.pipeline import SampleIndex
 from kmn_jax.train.optimizer import OptimizerConfig
-from kmn_jax.train.step import Metrics, StepConfig, SumGradients, Sums, TrainState, eval_step, train_step
+from kmn_jax.train.step import Metrics, Samples, StepConfig, SumGradients, Sums, TrainState, eval_step, train_step
 
-TrainStep = Callable[[TrainState, DevicePack, SampleIndex, Int[Array, ""]], tuple[TrainState, Metrics]]
-EvalStep = Callable[[nnx.State, DevicePack, SampleIndex], Sums]
+TrainStep = Callable[[TrainState, DevicePack, Samples, Int[Array, ""]], tuple[TrainState, Metrics]]
+EvalStep = Callable[[nnx.State, DevicePack, Samples], Sums]
 
 _AXIS = "data"
 _WHOLE, _SHARED = PartitionSpec(), PartitionSpec(_AXIS)
@@ -137,9 +136,9 @@ def put_number(value: int, mesh: Mesh) -> Int[Array, ""]:
     return jnp.asarray(_put(np.asarray(value, np.int32), _shardings(mesh)[0]))
 
 
-def put_batch(index: SampleIndex, mesh: Mesh) -> SampleIndex:
+def put_batch(samples: Samples, mesh: Mesh) -> Samples:
     """Spread a batch over the devices. Every process gives its own share."""
-    return _put(index, _shardings(mesh)[1])
+    return _put(samples, _shardings(mesh)[1])
 
 
 def any_process(flag: bool, mesh: Mesh) -> Array | bool:

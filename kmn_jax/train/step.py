@@ -18,7 +18,7 @@ from kmn_jax.data.device_pack import DevicePack
 from kmn_jax.data.pipeline import SampleIndex
 from kmn_jax.models import KeyMatchNetConfig, LossConfig, create_model, matching_loss
 from kmn_jax.models.losses import MatchingLoss
-from kmn_jax.train.examples import ExampleConfig, Group, make_group
+from kmn_jax.train.examples import ExampleConfig, Group, RenderedCrops, make_group
 from kmn_jax.typing import PRNGKey
 
 
@@ -37,6 +37,16 @@ class StepConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.average_decay < 1:
             raise InputError(f"average_decay = {self.average_decay} must be at least 0 and below 1")
+
+
+class RenderedSamples(NamedTuple):
+    """Samples whose crops were made before: what a step takes instead of the indices of a pack's scenes."""
+
+    samples: SampleIndex
+    crops: RenderedCrops
+
+
+Samples: TypeAlias = SampleIndex | RenderedSamples
 
 
 class TrainState(NamedTuple):
@@ -78,7 +88,7 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 # Parameters, pack, batch and a dropout key for each of its groups -> gradient and sums.
-SumGradients: TypeAlias = Callable[[nnx.State, DevicePack, SampleIndex, Array], tuple[nnx.State, Sums]]
+SumGradients: TypeAlias = Callable[[nnx.State, DevicePack, Samples, Array], tuple[nnx.State, Sums]]
 
 
 def create_state(config: StepConfig, optimizer: optax.GradientTransformation) -> tuple[nnx.GraphDef, TrainState]:
@@ -94,7 +104,7 @@ def train_step(
     config: StepConfig,
     state: TrainState,
     pack: DevicePack,
-    index: SampleIndex,
+    samples: Samples,
     number: Int[Array, ""] | None = None,
     spread: Callable[[SumGradients], SumGradients] = lambda function: function,
 ) -> tuple[TrainState, Metrics]:
@@ -104,9 +114,9 @@ def train_step(
     meant to be, it also stays in all later steps: what is kept is the state before the first one that failed.
     `spread` may have the sums over the batch computed by several devices.
     """
-    groups = index.object.shape[0] // config.crops_per_object
+    groups = index_of(samples).object.shape[0] // config.crops_per_object
     dropout = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.step), groups)
-    grads, sums = spread(partial(sum_gradients, graphdef, config))(state.parameters, pack, index, dropout)
+    grads, sums = spread(partial(sum_gradients, graphdef, config))(state.parameters, pack, samples, dropout)
     count = jnp.maximum(sums.num_crops, 1)
     grads = jax.tree.map(lambda leaf: leaf / count, grads)
     norm = optax.tree.norm(grads)
@@ -129,7 +139,7 @@ def sum_gradients(
     config: StepConfig,
     parameters: nnx.State,
     pack: DevicePack,
-    index: SampleIndex,
+    samples: Samples,
     dropout: Key[Array, " groups"],
 ) -> tuple[nnx.State, Sums]:
     """Return the gradient of the summed loss of a batch, and the sums, with one dropout key for each group.
@@ -158,11 +168,11 @@ def sum_gradients(
         )
         return jax.tree.map(jnp.add, own, pull(of_features)[0]), sums
 
-    return _summed(of_chunk, _chunks(index, dropout, config))
+    return _summed(of_chunk, _chunks(samples, dropout, config))
 
 
 def eval_step(
-    graphdef: nnx.GraphDef, config: StepConfig, parameters: nnx.State, pack: DevicePack, index: SampleIndex
+    graphdef: nnx.GraphDef, config: StepConfig, parameters: nnx.State, pack: DevicePack, samples: Samples
 ) -> Sums:
     """Return the sums of losses and accuracies over a batch of examples without augmentation or dropout.
 
@@ -177,7 +187,7 @@ def eval_step(
             _parts(groups, chunk, None, config),
         )
 
-    return _summed(of_chunk, _chunks(index, None, config))
+    return _summed(of_chunk, _chunks(samples, None, config))
 
 
 class _Chunk(NamedTuple):
@@ -187,6 +197,7 @@ class _Chunk(NamedTuple):
     drops: Int[Array, "c g"]
     keys: UInt32[Array, "c g 2"]
     counted: Bool[Array, "c g"]
+    rendered: RenderedCrops | None
     dropout: PRNGKey | None
 
 
@@ -201,9 +212,10 @@ class _Part(NamedTuple):
     dropout: PRNGKey | None
 
 
-def _chunks(index: SampleIndex, dropout: Key[Array, " groups"] | None, config: StepConfig) -> _Chunk:
+def _chunks(samples: Samples, dropout: Key[Array, " groups"] | None, config: StepConfig) -> _Chunk:
     """Split a batch into groups, and those into chunks along a new first axis."""
-    size, each = index.object.shape[0], config.crops_per_object
+    index, each = index_of(samples), config.crops_per_object
+    size = index.object.shape[0]
     groups = size // each
     at_once = max(1, config.crops_at_once // each) if config.crops_at_once else groups
     if size % each or groups % at_once:
@@ -211,16 +223,25 @@ def _chunks(index: SampleIndex, dropout: Key[Array, " groups"] | None, config: S
     shape = (groups // at_once, at_once, each)
     rows, drops, counted = (jnp.asarray(array).reshape(shape) for array in (index.object, index.drop, index.mask))
     keys = jnp.asarray(index.key).reshape(*shape, 2)
-    return _Chunk(rows[..., 0], drops, keys, counted, None if dropout is None else dropout.reshape(shape[:2]))
+    crops = samples.crops if isinstance(samples, RenderedSamples) else None
+    rendered = jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(*shape, *leaf.shape[1:]), crops)
+    return _Chunk(rows[..., 0], drops, keys, counted, rendered, None if dropout is None else dropout.reshape(shape[:2]))
+
+
+def index_of(samples: Samples) -> SampleIndex:
+    """Return which samples they are."""
+    return samples.samples if isinstance(samples, RenderedSamples) else samples
 
 
 def _make(pack: DevicePack, chunk: _Chunk, config: StepConfig, examples: ExampleConfig) -> Group:
     """Make the examples of a chunk."""
-    return jax.lax.stop_gradient(
-        jax.vmap(lambda row, drops, keys: make_group(pack, row, drops, keys, config.network, examples))(
-            chunk.row, chunk.drops, chunk.keys
-        )
-    )
+
+    def one(
+        row: Int[Array, ""], drops: Int[Array, " g"], keys: UInt32[Array, "g 2"], rendered: RenderedCrops | None
+    ) -> Group:
+        return make_group(pack, row, drops, keys, config.network, examples, rendered)
+
+    return jax.lax.stop_gradient(jax.vmap(one)(chunk.row, chunk.drops, chunk.keys, chunk.rendered))
 
 
 def _dropout_keys(
