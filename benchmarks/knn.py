@@ -16,8 +16,9 @@ import jax
 import numpy as np
 import tyro
 
-from benchmarks.timing import compile_for, print_table, time_in_turn, write_json
+from benchmarks.timing import compile_for, time_in_turn
 from kmn_jax.geometry.knn import k_nearest, squared_distances
+from kmn_jax.report import print_table, write_json
 
 
 def main(

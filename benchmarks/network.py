@@ -20,8 +20,9 @@ from flax import nnx
 from benchmarks.memory import peak_of_each
 from benchmarks.network_cases import Case, dense_jax_forward, make_case, torch_forward
 from benchmarks.stages import measure_stages
-from benchmarks.timing import Compiled, compile_for, measure_ceilings, print_table, time_in_turn, write_json
+from benchmarks.timing import Compiled, compile_for, measure_ceilings, time_in_turn
 from kmn_jax.models.layers import Compute
+from kmn_jax.report import print_table, write_json
 
 
 def main(

@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 from benchmarks.synthetic import box_surface, synthetic_matches
-from benchmarks.timing import compile_for, print_table, time_in_turn, write_json
+from benchmarks.timing import compile_for, time_in_turn
 from kmn_jax.geometry.se3 import (
     from_rotation_translation,
     pose_error,
@@ -27,6 +27,7 @@ from kmn_jax.geometry.se3 import (
     transform_points,
 )
 from kmn_jax.pose import IcpConfig, Matches, RansacConfig, icp, kabsch, ransac
+from kmn_jax.report import print_table, write_json
 
 DIAMETER = 50.0
 

@@ -9,24 +9,14 @@ shown.
 
 from __future__ import annotations
 
-import importlib.metadata
-import json
-import os
-import platform
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
-from pathlib import Path
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-
-ROOT = Path(__file__).parent.parent
 
 _TIMED_A_TURN = 3
 _PAUSE_S = 0.05
@@ -135,85 +125,3 @@ def measure_ceilings() -> Ceilings:
         flops / (1e-3 * times["bf16"].median_ms),
         8.0 * length / (1e-3 * times["copy"].median_ms),
     )
-
-
-def environment() -> dict[str, Any]:
-    """Return device, versions, commit, date and command."""
-    packages = ("jax", "jaxlib", "flax", "numpy", "torch", "open3d")
-    versions = {"python": platform.python_version()}
-    for package in packages:
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return {
-        "device": str(jax.devices()[0].device_kind),
-        "platform": jax.default_backend(),
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "versions": versions,
-        "commit": _commit(),
-        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        "command": " ".join(["python -m", _module(), *sys.argv[1:]]),
-    }
-
-
-def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Print rows of equal keys as a Markdown table."""
-    print(f"\n### {title}\n")
-    if not rows:
-        print("(nothing ran)")
-        return
-    columns = list(rows[0])
-    cells = [columns, *([_format(row.get(column)) for column in columns] for row in rows)]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
-    for index, row in enumerate(cells):
-        print("| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |")
-        if index == 0:
-            print("|" + "|".join("-" * (width + 2) for width in widths) + "|")
-    sys.stdout.flush()
-
-
-def write_json(path: Path | None, results: Mapping[str, Any]) -> None:
-    """Write results and environment to `path`, if there is one."""
-    if path is None:
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"environment": environment(), **results}, indent=1, default=_plain) + "\n")
-    print(f"\nwrote {path}")
-
-
-def _plain(value: Any) -> Any:
-    return asdict(value) if hasattr(value, "__dataclass_fields__") else float(value)
-
-
-def _format(value: Any) -> str:
-    if value is None:
-        return "-"
-    if isinstance(value, float):
-        return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
-    return str(value)
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
-
-
-def _commit() -> str:
-    try:
-        result = subprocess.run(
-            ["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True, check=True
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return result.stdout.strip()
-
-
-def _module() -> str:
-    main = sys.modules.get("__main__")
-    specification = getattr(main, "__spec__", None)
-    return specification.name if specification is not None else Path(sys.argv[0]).stem

@@ -17,6 +17,7 @@ RANKS = {
     "typing": 0,
     "checks": 0,
     "files": 0,
+    "report": 0,
     "geometry": 1,
     "models": 2,
     "pose": 3,

@@ -19,6 +19,8 @@ class TrainConfig:
     name: str
     pack: str  # folder of the pack
     num_steps: int
+    rendered: str | None = None  # folder of a BOP dataset: training crops come from its images, not the pack's scenes
+    rendered_split: str = "train"  # the folder of its scenes
     network: KeyMatchNetConfig = field(default_factory=KeyMatchNetConfig)
     examples: ExampleConfig = field(default_factory=ExampleConfig)
     loss: LossConfig = field(default_factory=LossConfig)
@@ -39,6 +41,11 @@ class TrainConfig:
                 raise InputError(f"{name} = {getattr(self, name)} must be at least 1")
         if not 0 < self.training_share <= 1:
             raise InputError(f"training_share = {self.training_share} must be above 0 and up to 1")
+        if self.rendered is not None and self.training_share < 1:
+            raise InputError(
+                f"training_share = {self.training_share} is of the pack's objects, but rendered = {self.rendered} has"
+                " its own: leave one of them"
+            )
         if self.pipeline.epochs is not None:
             raise InputError(
                 f"pipeline.epochs = {self.pipeline.epochs}, but num_steps says how long a run is: leave it"

@@ -1,7 +1,8 @@
-"""The data of a run: the training and validation objects of a pack, on the devices, and the order of their samples."""
+"""The data of a run: training and validation objects, on the devices, and the order of their samples."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import jax
@@ -10,26 +11,31 @@ from jax.sharding import Mesh
 
 from kmn_jax.data.device_pack import DevicePack, StackedPack, stack_pack
 from kmn_jax.data.pack import Pack
-from kmn_jax.data.pipeline import PipelineConfig, SampleBatches
+from kmn_jax.data.pipeline import PipelineConfig, SampleBatches, SampleIndex
 from kmn_jax.train.config import TrainConfig
+from kmn_jax.train.rendered import rendered_frames
 from kmn_jax.train.sharding import put_whole
+from kmn_jax.train.step import Samples
 
 _VALIDATION_SEED = 0  # of the samples, so that runs of all seeds are validated on the same
 
 
 @dataclass(frozen=True)
 class Source:
-    """Objects of a pack and batches of their samples, of which each process has its share."""
+    """Objects and batches of their samples, of which each process has its share."""
 
     pack: DevicePack
     names: tuple[str, ...]
     digest: str
     batches: SampleBatches
     problems: tuple[str, ...]
+    read: Callable[[SampleIndex], Samples] | None = None  # makes a batch on the host, if the steps do not
 
 
 def training_source(config: TrainConfig, mesh: Mesh) -> Source:
     """Return the training objects, or the configured share of them, and their endless samples."""
+    if config.rendered is not None:
+        return _rendered_source(config, config.rendered, mesh)
     pack = Pack(config.pack)
     names = pack.names("train")
     count = max(1, round(config.training_share * len(names)))
@@ -59,3 +65,12 @@ def _source(stacked: StackedPack, pipeline: PipelineConfig, mesh: Mesh, ordered:
         ordered=ordered,
     )
     return Source(put_whole(stacked.arrays, mesh), stacked.names, stacked.digest, batches, stacked.problems)
+
+
+def _rendered_source(config: TrainConfig, folder: str, mesh: Mesh) -> Source:
+    problems: list[str] = []
+    frames = rendered_frames(folder, config.rendered_split, config.network, config.examples.crops, problems.append)
+    batches = SampleBatches(
+        config.pipeline, frames.num_frames, 1, shard_index=jax.process_index(), shard_count=jax.process_count()
+    )
+    return Source(put_whole(frames.pack, mesh), frames.names, frames.digest, batches, tuple(problems), frames.read)

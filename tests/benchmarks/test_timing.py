@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from benchmarks.memory import _peak_above_use
-from benchmarks.timing import Ceilings, compile_for, print_table, time_in_turn, write_json
+from benchmarks.timing import Ceilings, compile_for, time_in_turn
+from kmn_jax.report import print_table, write_json
 
 
 def test_compilation_is_apart_from_running() -> None:

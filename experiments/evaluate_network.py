@@ -1,0 +1,172 @@
+"""How well a network tells the seed's instance and its keypoints: `python -m experiments.evaluate_network`.
+
+Loss, segmentation accuracy and keypoint accuracy on training, validation and test objects, and for each test object:
+the published Tables I and II beside ours. Training and validation crops are those of a pack, without noise; test crops
+are of ray-cast depth images of objects that were never trained on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from kmn_jax.checks import InputError
+from kmn_jax.data.bop_models import NAMES_FILE
+from kmn_jax.data.crops import CropConfig
+from kmn_jax.data.device_pack import DevicePack, stack_pack
+from kmn_jax.data.pack import Pack
+from kmn_jax.data.pipeline import PipelineConfig, SampleBatches
+from kmn_jax.models import LossConfig, Model, load_model
+from kmn_jax.report import print_table, write_json
+from kmn_jax.train.examples import ExampleConfig
+from kmn_jax.train.rendered import rendered_frames
+from kmn_jax.train.sharding import data_mesh, jit_eval_step, put_batch, put_whole
+from kmn_jax.train.step import Samples, StepConfig, Sums, index_of, mean_metrics
+
+SHIPPED = Path("kmn_jax/pretrained/small.safetensors")
+_TEST_SETS = (Path("outputs/test_sets/electronics"), Path("outputs/test_sets/industrial"))
+_CROPS_A_FRAME = 5  # of a test image
+
+# arXiv 2303.16102, Table I: the test split of the electronic components, trained on all objects or on a tenth of them.
+PUBLISHED = (
+    {"split": "published: test", "loss": 1.56, "segmentation": 0.95, "keypoints": 0.27},
+    {"split": "published: test, a tenth of the objects", "loss": 1.65, "segmentation": 0.94, "keypoints": 0.24},
+)
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is evaluated, on how much."""
+
+    model: tyro.conf.Positional[Path] = SHIPPED  # a file of weights, or the folder of a run
+    pack: Path = Path(
+        "outputs/packs/electronics"
+    )  # of training and validation objects; none if there is no such folder
+    training_objects: int = 200  # spread evenly over the pack's
+    crops: int = 20  # of each training and validation object
+    test_sets: tuple[Path, ...] = _TEST_SETS  # BOP datasets with a split `test`
+    crops_a_frame: int = _CROPS_A_FRAME
+    json: Path | None = None  # file to write the numbers to
+
+
+class Evaluator:
+    """One network, compiled once: sums of losses and accuracies of batches of one object's crops each."""
+
+    def __init__(self, model: Model, crops_at_once: int | None) -> None:
+        self.network = model.config
+        self.examples = ExampleConfig(crops=CropConfig(num_points=model.config.num_scene_points)).plain()
+        self._graphdef, self._at_once = model.graphdef, crops_at_once
+        self._mesh = data_mesh(jax.devices()[:1])
+        self._parameters = put_whole(model.parameters, self._mesh)
+
+    def rows(self, pack: DevicePack, names: Sequence[str], batches: Iterator[Samples]) -> dict[str, Sums]:
+        """Return the sums of each object. Every batch holds crops of one of them."""
+        pack = put_whole(pack, self._mesh)
+        found: dict[str, list[Sums]] = {name: [] for name in names}
+        for samples in batches:
+            index = index_of(samples)
+            config = StepConfig(self.network, self.examples, LossConfig(), len(index.object), self._at_once, 0.0, 0)
+            step = jit_eval_step(self._graphdef, config, self._mesh)
+            sums = step(self._parameters, pack, put_batch(samples, self._mesh))
+            found[names[int(index.object[0])]].append(jax.device_get(sums))
+        return {name: total(parts) for name, parts in found.items() if parts}
+
+
+def total(parts: Sequence[Sums]) -> Sums:
+    """Return the sum of sums."""
+    return Sums(*(jnp.float32(np.sum(column, dtype=np.float64)) for column in zip(*parts, strict=True)))
+
+
+def pack_rows(evaluator: Evaluator, folder: Path, split: str, most: int | None, crops: int) -> dict[str, Sums]:
+    """Evaluate a split of a pack, or so many of its objects, spread evenly."""
+    pack = Pack(folder)
+    names = pack.names(split)
+    count = min(most or len(names), len(names))
+    stacked = stack_pack(pack, [names[row * len(names) // count] for row in range(count)])
+    pipeline = PipelineConfig(batch_size=crops, crops_per_object=crops, samples_per_object=crops)
+    batches = SampleBatches(pipeline, count, np.asarray(stacked.arrays.num_drops), ordered=True)
+    return evaluator.rows(stacked.arrays, stacked.names, (batches[number] for number in range(len(batches))))
+
+
+def test_rows(evaluator: Evaluator, folder: Path, crops: int) -> dict[str, Sums]:
+    """Evaluate the test images of a BOP dataset."""
+    frames = rendered_frames(folder, "test", evaluator.network, evaluator.examples.crops, report)
+    pipeline = PipelineConfig(batch_size=crops, crops_per_object=crops, samples_per_object=crops)
+    batches = SampleBatches(pipeline, frames.num_frames, 1, ordered=True)
+    path = folder / "models" / NAMES_FILE
+    names = {f"{int(key):06d}": name for key, name in json.loads(path.read_text()).items()} if path.exists() else {}
+    read = (frames.read(batches[number]) for number in range(len(batches)))
+    return evaluator.rows(frames.pack, [names.get(name, name) for name in frames.names], read)
+
+
+def row(name: str, sums: Sums, objects: int = 1) -> dict[str, Any]:
+    """Return a row of the table."""
+    means = mean_metrics(sums)
+    return {
+        "split": name,
+        "objects": objects,
+        "crops": int(sums.num_crops),
+        "loss": float(means.loss),
+        "segmentation": float(means.segmentation_accuracy),
+        "keypoints": float(means.keypoint_accuracy),
+    }
+
+
+def report(problem: str) -> None:
+    """Tell what was left out."""
+    print(f"left out: {problem}", file=sys.stderr)
+
+
+def evaluate(options: Options) -> dict[str, Any]:
+    """Evaluate, print the tables, and return them with what they were made by."""
+    path = options.model / "model.safetensors" if options.model.is_dir() else options.model
+    model = load_model(path)
+    evaluator = Evaluator(model, 1 if jax.default_backend() == "cpu" else None)
+    splits: list[dict[str, Any]] = []
+    details: dict[str, list[dict[str, Any]]] = {}
+    if options.pack.exists():
+        for split, most in (("train", options.training_objects), ("validation", None)):
+            found = pack_rows(evaluator, options.pack, split, most, options.crops)
+            splits.append(row(f"{split}, {options.pack.name}", total(list(found.values())), len(found)))
+    for folder in options.test_sets:
+        found = test_rows(evaluator, folder, options.crops_a_frame)
+        splits.append(row(f"test, {folder.name}", total(list(found.values())), len(found)))
+        details[folder.name] = [row(name, sums) for name, sums in found.items()]
+    print_table("Loss and accuracies (Table I)", [*splits, *PUBLISHED])
+    for name, rows in details.items():
+        print_table(f"Each test object of {name} (Table II)", rows)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return {
+        "model": path.name,
+        "sha256": digest,
+        "options": {key: str(value) for key, value in asdict(options).items()},
+        "splits": splits,
+        "published": PUBLISHED,
+        "objects": details,
+    }
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Evaluate a network: 0 is success, 2 bad input, in one sentence on stderr."""
+    try:
+        options = tyro.cli(Options, args=arguments, prog="experiments.evaluate_network", description=__doc__)
+        results = evaluate(options)
+        write_json(options.json, results)
+    except InputError as error:
+        print(f"evaluate_network: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
