@@ -135,12 +135,16 @@ def evaluate(options: Options) -> dict[str, Any]:
     splits: list[dict[str, Any]] = []
     details: dict[str, list[dict[str, Any]]] = {}
     if options.pack.exists():
-        for split, most in (("train", options.training_objects), ("validation", None)):
+        for split, most in (("train", options.training_objects), ("validation", None), ("test", None)):
+            if not Pack(options.pack).names(split):
+                continue
             found = pack_rows(evaluator, options.pack, split, most, options.crops)
-            splits.append(row(f"{split}, {options.pack.name}", total(list(found.values())), len(found)))
+            splits.append(
+                row(f"{split}, {options.pack.name}, training renderer", total(list(found.values())), len(found))
+            )
     for folder in options.test_sets:
         found = test_rows(evaluator, folder, options.crops_a_frame)
-        splits.append(row(f"test, {folder.name}", total(list(found.values())), len(found)))
+        splits.append(row(f"test, {folder.name}, ray casting", total(list(found.values())), len(found)))
         details[folder.name] = [row(name, sums) for name, sums in found.items()]
     print_table("Loss and accuracies (Table I)", [*splits, *PUBLISHED])
     for name, rows in details.items():

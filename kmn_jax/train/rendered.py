@@ -23,6 +23,7 @@ from kmn_jax.train.examples import RenderedCrops
 from kmn_jax.train.step import RenderedSamples
 
 _UNIT = "m"
+_NUM_POINTS = 4096  # on an object, of which examples take a part, as from a pack
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def rendered_frames(
     Problems of single frames and objects go to `report`. Raises InputError if nothing of it can be used.
     """
     dataset = BopDataset.open(folder, split, unit=_UNIT)
-    models, problems = load_models(dataset, ObjectConfig(num_points=network.num_object_points))
+    models, problems = load_models(dataset, ObjectConfig(num_points=max(_NUM_POINTS, network.num_object_points)))
     for problem in problems:
         if report is not None:
             report(problem)
