@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.timing import ROOT
+_ROOT = Path(__file__).parent.parent
 
 
 def peak_of_each(forms: Sequence[str]) -> dict[str, int]:
@@ -22,7 +22,7 @@ def peak_of_each(forms: Sequence[str]) -> dict[str, int]:
     for form in forms:
         environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"}
         command = [sys.executable, "-m", "benchmarks.memory", form]
-        result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+        result = subprocess.run(command, cwd=_ROOT, env=environment, capture_output=True, text=True)
         if result.returncode != 0:
             last = result.stderr.strip().splitlines()[-1:] or ["no message"]
             print(f"{form}: memory not measured: {last[0]}")

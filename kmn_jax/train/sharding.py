@@ -20,8 +20,19 @@ from jaxtyping import Array, Int
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.device_pack import DevicePack
+from kmn_jax.train.examples import Group
 from kmn_jax.train.optimizer import OptimizerConfig
-from kmn_jax.train.step import Metrics, Samples, StepConfig, SumGradients, Sums, TrainState, eval_step, train_step
+from kmn_jax.train.step import (
+    Metrics,
+    Samples,
+    StepConfig,
+    SumGradients,
+    Sums,
+    TrainState,
+    eval_step,
+    make_samples,
+    train_step,
+)
 
 TrainStep = Callable[[TrainState, DevicePack, Samples, Int[Array, ""]], tuple[TrainState, Metrics]]
 EvalStep = Callable[[nnx.State, DevicePack, Samples], Sums]
@@ -35,8 +46,8 @@ _T = TypeVar("_T")
 
 def initialize_distributed(
     coordinator: str | None = None, processes: int | None = None, process: int | None = None
-) -> None:
-    """Join the run's other processes, if there are any; call it before JAX is used for anything else.
+) -> bool:
+    """Join the run's other processes and tell whether there are any; call it before JAX is used for anything else.
 
     Without arguments the processes that SLURM, MPI or an indexed job of Kubernetes has started find each other.
     Otherwise give the first one's host:port as `coordinator`, how many `processes` there are, and which `process` this
@@ -48,7 +59,7 @@ def initialize_distributed(
     elif not coordinator and processes is None and process is None:
         started = any(os.environ.get(name, "1") != "1" for name in _COUNTS)
         if not started and _KUBERNETES not in os.environ:
-            return
+            return False
     else:
         raise InputError(
             f"coordinator = {coordinator}, processes = {processes} and process = {process} belong together: give all"
@@ -60,6 +71,7 @@ def initialize_distributed(
             f"this is one of several processes, but they cannot be joined ({error}): give coordinator, processes and"
             " process"
         ) from None
+    return True
 
 
 def split_cpu(groups: int) -> None:
@@ -124,6 +136,16 @@ def jit_eval_step(graphdef: nnx.GraphDef, config: StepConfig, mesh: Mesh) -> Eva
     whole, shared = _shardings(mesh)
     step = jax.shard_map(summed, mesh=mesh, in_specs=(_WHOLE, _WHOLE, _SHARED), out_specs=_WHOLE, check_vma=False)
     return jax.jit(step, in_shardings=(whole, whole, shared), out_shardings=whole)
+
+
+@lru_cache(maxsize=4)
+def jit_make_samples(config: StepConfig, mesh: Mesh) -> Callable[[DevicePack, Samples], Group]:
+    """Return what makes the examples of a batch, compiled for the mesh: the share of a step that is data."""
+    whole, shared = _shardings(mesh)
+    made = jax.shard_map(
+        partial(make_samples, config), mesh=mesh, in_specs=(_WHOLE, _SHARED), out_specs=PartitionSpec(None, _AXIS)
+    )
+    return jax.jit(made, in_shardings=(whole, shared))
 
 
 def put_whole(tree: _T, mesh: Mesh) -> _T:

@@ -190,6 +190,11 @@ def eval_step(
     return _summed(of_chunk, _chunks(samples, None, config))
 
 
+def make_samples(config: StepConfig, pack: DevicePack, samples: Samples) -> Group:
+    """Return the examples of a batch as a training step makes them, with leading axes for chunks and their groups."""
+    return jax.lax.map(lambda chunk: _make(pack, chunk, config, config.examples), _chunks(samples, None, config))
+
+
 class _Chunk(NamedTuple):
     """Groups that are computed side by side: c of them, g samples each."""
 
