@@ -39,19 +39,20 @@ def environment() -> dict[str, Any]:
 
 
 def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Print rows of equal keys as a Markdown table."""
-    print(f"\n### {title}\n")
-    if not rows:
-        print("(nothing ran)")
-        return
+    """Print rows as a Markdown table; the first one names the columns."""
+    print(f"\n### {title}\n\n{markdown_table(rows) if rows else '(nothing ran)'}", flush=True)
+
+
+def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return rows as a Markdown table; the first one names the columns, and what a row lacks is a dash."""
     columns = list(rows[0])
     cells = [columns, *([_format(row.get(column)) for column in columns] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
-    for index, row in enumerate(cells):
-        print("| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |")
-        if index == 0:
-            print("|" + "|".join("-" * (width + 2) for width in widths) + "|")
-    sys.stdout.flush()
+    lines = [
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in cells
+    ]
+    lines.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
+    return "\n".join(lines)
 
 
 def write_json(path: Path | None, results: Mapping[str, Any]) -> None:

@@ -13,7 +13,7 @@ from kmn_jax.models.keymatchnet import (
 )
 from kmn_jax.models.losses import LossConfig, MatchingLoss, keypoint_labels, matching_loss
 from kmn_jax.models.released import RELEASED_CONFIG, load_released, save_released
-from kmn_jax.models.weights import load_model, save_model
+from kmn_jax.models.weights import load_model, load_pretrained, save_model
 
 __all__ = [
     "RELEASED_CONFIG",
@@ -28,6 +28,7 @@ __all__ = [
     "encode_scene",
     "keypoint_labels",
     "load_model",
+    "load_pretrained",
     "load_released",
     "match",
     "matching_loss",

@@ -37,6 +37,19 @@ def is_model_file(path: str | Path) -> bool:
         return False
 
 
+def load_pretrained(name: str = "small") -> Model:
+    """Load a released model, one of those in `kmn_jax/pretrained/`, where a card tells what it can do.
+
+    Raises InputError if there is none of that name.
+    """
+    folder = Path(__file__).parent.parent / "pretrained"
+    path = folder / f"{name}.safetensors"
+    if not path.is_file():
+        names = ", ".join(sorted(file.stem for file in folder.glob("*.safetensors"))) or "none"
+        raise InputError(f"there is no released model {name!r}: there are {names}")
+    return load_model(path)
+
+
 def load_model(path: str | Path) -> Model:
     """Load a model that `save_model` wrote.
 

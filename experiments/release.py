@@ -1,0 +1,168 @@
+"""Make a run's best weights the released ones: `python -m experiments.release RUN`.
+
+Writes to `kmn_jax/pretrained/`: the weights, the learning curve as CSV and as a picture, and a model card with all that
+is known of the run. Give the JSON of `experiments.evaluate_network` of the same weights for the card's tables.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import tyro
+
+from kmn_jax.checks import InputError
+from kmn_jax.files import write_whole
+from kmn_jax.models import load_model
+from kmn_jax.report import environment, markdown_table
+from kmn_jax.train.records import read_metrics
+
+FOLDER = Path(__file__).parent.parent / "kmn_jax" / "pretrained"
+LIMIT = 10_000_000  # bytes of a released file
+_COLUMNS = ("step", "samples", "seconds", "split", "loss", "segmentation_accuracy", "keypoint_accuracy")
+_PUBLISHED_SAMPLES = 27_840_000  # arXiv 2303.16102: 120 epochs of 232,000
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is released."""
+
+    run: tyro.conf.Positional[Path]  # folder of the run
+    evaluation: Path  # what `python -m experiments.evaluate_network RUN --json` wrote
+    name: str | None = None  # of the released model; the run's unless given
+    folder: Path = FOLDER
+
+
+def release(options: Options) -> list[Path]:
+    """Write weights, curve, picture and card, and return their paths."""
+    source = options.run / "model.safetensors"
+    model = load_model(source)
+    rows = read_metrics(options.run)
+    config, evaluation = _json(options.run / "config.json"), _json(options.evaluation)
+    weights = source.read_bytes()
+    digest = hashlib.sha256(weights).hexdigest()
+    if evaluation.get("sha256") != digest:
+        raise InputError(
+            f"{options.evaluation} is of other weights than {source}: run python -m experiments.evaluate_network"
+            f" {options.run} --json {options.evaluation} again"
+        )
+    if len(weights) > LIMIT:
+        raise InputError(f"{source} has {len(weights)} bytes, but a released file at most {LIMIT}")
+    validated = [row for row in rows if row["split"] == "validation"]
+    if not validated:
+        raise InputError(f"{options.run} has no validation yet: nothing says which weights are the best")
+    name = options.name or str(config["name"])
+    paths = {kind: options.folder / f"{name}{kind}" for kind in (".safetensors", ".csv", ".png", ".md")}
+    options.folder.mkdir(parents=True, exist_ok=True)
+    write_whole(paths[".safetensors"], weights)
+    write_whole(paths[".csv"], _curve(rows).encode())
+    _picture(rows, paths[".png"])
+    sessions = [json.loads(line) for line in (options.run / "sessions.jsonl").read_text().splitlines()]
+    size = sum(int(leaf.size) for leaf in jax.tree.leaves(model.parameters))
+    card = _card(name, config, sessions, validated, evaluation, size, digest)
+    write_whole(paths[".md"], card.encode())
+    return list(paths.values())
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {path} ({error})") from None
+
+
+def _curve(rows: list[dict[str, Any]]) -> str:
+    lines = [",".join(_COLUMNS)]
+    for row in rows:
+        cells = (row[column] for column in _COLUMNS)
+        lines.append(",".join(f"{cell:.6g}" if isinstance(cell, float) else str(cell) for cell in cells))
+    return "\n".join(lines) + "\n"
+
+
+def _picture(rows: list[dict[str, Any]], path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, 3, figsize=(13, 4), layout="constrained")
+    names = {"loss": "loss", "segmentation_accuracy": "segmentation accuracy", "keypoint_accuracy": "keypoint accuracy"}
+    for axis, (key, label) in zip(axes, names.items(), strict=True):
+        for split, style in (("train", {"lw": 0.7, "alpha": 0.6}), ("validation", {"marker": "o", "ms": 3})):
+            chosen = [row for row in rows if row["split"] == split]
+            axis.plot([row["samples"] for row in chosen], [row[key] for row in chosen], label=split, **style)
+        axis.set(xscale="log", xlabel="samples", title=label)
+        axis.grid(alpha=0.3)
+    axes[0].legend()
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+    pyplot.close(figure)
+
+
+def _card(
+    name: str,
+    config: dict[str, Any],
+    sessions: list[dict[str, Any]],
+    validated: list[dict[str, Any]],
+    evaluation: dict[str, Any],
+    parameters: int,
+    digest: str,
+) -> str:
+    best = min(validated, key=lambda row: float(row["loss"]))
+    last, network = validated[-1], config["network"]
+    devices = sorted({device for session in sessions for device in session["devices"]})
+    made_by = environment()
+    facts = {
+        "Weights": f"`{name}.safetensors`, {parameters:,} parameters, SHA-256 `{digest[:16]}…`",
+        "Network": f"N = {network['num_scene_points']} scene points, M = {network['num_object_points']} object points,"
+        f" K = {network['num_keypoints']} keypoints, k = {network['num_neighbors']} neighbours, {network['inputs']}"
+        f" inputs, {network['graph']} graph, {network['compute']}",
+        "Data": f"pack `{Path(config['pack']).name}`: {sessions[-1]['training_objects']} training and"
+        f" {sessions[-1]['validation_objects']} validation objects, scenes of docs/data.md, made during training",
+        "Samples": f"{best['samples']:,} seen by these weights (step {best['step']:,}; the run has validated up to step"
+        f" {last['step']:,} of {config['num_steps']:,}). The published network saw {_PUBLISHED_SAMPLES:,}:"
+        f" {_PUBLISHED_SAMPLES / best['samples']:.0f} times as many",
+        "Optimizer": f"{config['optimizer']['method']}, rate {config['optimizer']['learning_rate']},"
+        f" {config['optimizer']['schedule']} schedule, batch {config['pipeline']['batch_size']}, mean of parameters"
+        f" with decay {config['average_decay']}",
+        "Time": f"{best['seconds'] / 3600:.1f} hours until then, on {len(sessions[-1]['devices'])} x"
+        f" {', '.join(devices)} ({made_by['processor']}, {made_by['cores']} cores), other work beside it",
+        "Command": f"`python -m experiments.train {config['name']}`, then `python -m experiments.release`",
+        "Commits": ", ".join(sorted({str(session["commit"]) for session in sessions if session["commit"]}))
+        or "unknown",
+        "Versions": ", ".join(f"{key} {value}" for key, value in sessions[-1]["versions"].items()),
+        "Validation": f"loss {best['loss']:.3f}, segmentation accuracy {best['segmentation_accuracy']:.3f}, keypoint"
+        f" accuracy {best['keypoint_accuracy']:.3f}; selected by the loss",
+    }
+    parts = [f"# {name}", "Made by `experiments/release.py`; change that, not this file.", f"![Curve]({name}.png)"]
+    parts.append("\n".join(f"- **{key}**: {value}." for key, value in facts.items()))
+    parts.append("## Loss and accuracies\n\nPublished rows are of the authors' data, not of ours.")
+    parts.append(markdown_table([*evaluation["splits"], *evaluation["published"]]))
+    for folder, rows in evaluation["objects"].items():
+        parts.append(f"## Test objects: {folder}\n\n{markdown_table(rows)}")
+    parts.append(
+        "## What it leaves on the table\n\n"
+        f"Keypoint accuracy on validation objects went from {validated[0]['keypoint_accuracy']:.3f} after"
+        f" {validated[0]['samples']:,} samples to {last['keypoint_accuracy']:.3f} after {last['samples']:,}; see the"
+        " curve for whether it still rises. The published accuracy took many more samples."
+    )
+    return "\n\n".join(parts) + "\n"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Release a run's weights: 0 is success, 2 bad input, in one sentence on stderr."""
+    try:
+        for path in release(tyro.cli(Options, args=arguments, prog="experiments.release", description=__doc__)):
+            print(f"wrote {path}")
+    except InputError as error:
+        print(f"release: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
