@@ -7,6 +7,7 @@ A run stops between two steps, with everything saved, when it gets SIGTERM or SI
 
 from __future__ import annotations
 
+import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,9 +46,8 @@ def main(arguments: list[str] | None = None) -> int:
             return 0 if name in ("-h", "--help") else 2
         options = _parse(name, rest)
         folder = options.folder or Path("runs") / name
-        if not options.processes:
+        if not initialize_distributed(options.coordinator, options.processes, options.process):
             split_cpu(options.config.pipeline.groups_per_batch)
-        initialize_distributed(options.coordinator, options.processes, options.process)
         outcome = train(
             options.config,
             folder,
@@ -60,14 +60,23 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"train: {error}", file=sys.stderr)
         return 2 if isinstance(error, InputError) else 1
     if outcome.reason:
-        again = [argument for argument in rest if argument != "--resume"]
         print(
             f"stopped after step {outcome.step} of {options.config.num_steps} because {outcome.reason}; go on with:"
-            f" python -m experiments.train {' '.join([name, *again])} --resume"
+            f" python -m experiments.train {shlex.join([name, *_again(rest)])}"
         )
     else:
         print(f"done: {outcome.step} steps; best validation loss {outcome.best_loss} at step {outcome.best_step}")
     return 0
+
+
+def _again(arguments: list[str]) -> list[str]:
+    """Return the arguments that go on with a run: an export is neither taken nor written a second time."""
+    kept, skipped = [], False
+    for argument in arguments:
+        if not skipped and argument.partition("=")[0] not in ("--resume", "--import", "--export"):
+            kept.append(argument)
+        skipped = argument in ("--import", "--export")
+    return [*kept, "--resume"]
 
 
 def _parse(name: str, arguments: list[str]) -> Options:

@@ -39,6 +39,8 @@ class TrainConfig:
         for name in ("num_steps", "validate_every", "validation_samples", "checkpoint_every", "log_every"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)} must be at least 1")
+        if not 0 <= self.seed < 2**32:
+            raise InputError(f"seed = {self.seed} must be from 0 to 2**32 - 1")
         if not 0 < self.training_share <= 1:
             raise InputError(f"training_share = {self.training_share} must be above 0 and up to 1")
         if self.rendered is not None and self.training_share < 1:

@@ -126,6 +126,15 @@ def _check(
         raise InputError(f"{export_to} holds an export already: choose another folder to export to")
     if exists:
         check_config(folder, asdict(config), _FREE)
+    if export_to is not None:
+        _make_folder(Path(export_to))
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make the folder {folder}: {error.strerror}") from None
 
 
 class _Run:
@@ -159,13 +168,14 @@ class _Run:
     def restore(self, import_from: str | Path | None) -> None:
         """Go on from an exported snapshot or the last checkpoint, if there is one."""
         found = self.checkpoints.latest(self.state) if import_from is None else import_snapshot(import_from, self.state)
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"cannot make the folder {self.folder}: {error.strerror}") from None
+        if found is None:
+            from_first_process(self._check_none)
+        _make_folder(self.folder)
         if found is not None:
             self._take(found)
             self.report(f"going on at step {self.step} of {self.config.num_steps}")
+        if import_from is not None:
+            self._save(best=False)  # before there is a config: a run that can be resumed must not begin anew
         if self.first:
             for name in _CARRIED if import_from is not None else ():
                 if (Path(import_from or "") / name).exists():
@@ -173,6 +183,15 @@ class _Run:
             write_config(self.folder, asdict(self.config))
             facts = {"training_objects": len(self.training.names), "validation_objects": len(self.validation.names)}
             write_session(self.folder, self.step, facts)
+
+    def _check_none(self) -> None:
+        """See that a run without a usable checkpoint has none: it would begin anew and replace what can be mended."""
+        if self.checkpoints.steps:
+            steps = ", ".join(map(str, self.checkpoints.steps))
+            raise InputError(
+                f"all checkpoints in {self.checkpoints.folder} are damaged (steps {steps}): put back a copy of one, or"
+                " choose another folder to begin anew"
+            )
 
     def loop(self, progress: bool) -> Outcome:
         """Train until done or stopped."""
@@ -183,7 +202,8 @@ class _Run:
         total, done = config.num_steps * size, self.step * size
         interval = 1.0 if sys.stderr.isatty() else 30.0
         with ExitStack() as stack:
-            self.files = stack.enter_context(MetricFiles(self.folder, self.step)) if self.first else None
+            files = MetricFiles(self.folder, self.step, self.validated) if self.first else None
+            self.files = files and stack.enter_context(files)
             self.bar = tqdm(total=total, initial=done, unit=" samples", disable=quiet, mininterval=interval)
             stack.enter_context(self.bar)
             self.window = Window(self.window.saved())
@@ -296,10 +316,11 @@ class _Run:
         return self.seconds_before + time.monotonic() - self.began
 
     def _save(self, best: bool) -> None:
-        self.checkpoints.save(self._snapshot(), best=best)
-        self.saved = self.step
+        # The model first: a run that is killed in between validates again, and writes both.
         if best and self.first:
             save_model((self.graphdef, self.state.average), self.folder / "model.safetensors")
+        self.checkpoints.save(self._snapshot(), best=best)
+        self.saved = self.step
 
     def _snapshot(self) -> Snapshot:
         facts = {
@@ -337,6 +358,7 @@ class _Run:
         ]
         facts = {"step": done.number, "loss": str(metrics.loss), "gradient_norm": str(metrics.gradient_norm)}
         content = json.dumps({**facts, "samples": samples}, indent=1).encode()
+        _make_folder(apart)
         write_whole(apart / f"batch{jax.process_index()}.json", content)
         some = ", ".join(dict.fromkeys(names[: 4 * self.config.pipeline.crops_per_object]))
         raise NotFiniteError(

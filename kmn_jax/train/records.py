@@ -44,10 +44,14 @@ Row = Mapping[str, float | int | str]
 class MetricFiles:
     """`metrics.jsonl`, the same as `metrics.csv`, and TensorBoard event files in `events/`."""
 
-    def __init__(self, folder: Path, step: int) -> None:
-        """Keep the rows up to a step, those of a run that goes on from there, and drop later ones and broken lines."""
+    def __init__(self, folder: Path, step: int, validated: int) -> None:
+        """Keep the rows up to a step, those of a run that goes on from there, and drop later ones and broken lines.
+
+        Rows of validations are kept up to step `validated`.
+        """
         self._lines, self._table = folder / "metrics.jsonl", folder / "metrics.csv"
-        kept = [row for row in read_metrics(folder) if row["step"] <= step]
+        last = {"validation": validated}
+        kept = [row for row in read_metrics(folder) if row["step"] <= last.get(str(row.get("split")), step)]
         write_whole(self._lines, "".join(json.dumps(row) + "\n" for row in kept).encode())
         write_whole(self._table, _csv([dict.fromkeys(COLUMNS, "") | dict(row) for row in kept], header=True).encode())
         self._events = EventFile(folder / "events", step + 1)
