@@ -45,7 +45,7 @@ from kmn_jax.train.sharding import (
 )
 from kmn_jax.train.snapshot import Snapshot, from_first_process
 from kmn_jax.train.sources import training_source, validation_source
-from kmn_jax.train.step import Metrics, create_state, mean_metrics
+from kmn_jax.train.step import Metrics, Samples, create_state, index_of, mean_metrics
 from kmn_jax.train.stop import StopRequest
 from kmn_jax.train.transfer import FILE_LIMIT, MANIFEST, export_snapshot, import_snapshot
 from kmn_jax.train.window import MEANS, Window
@@ -53,6 +53,7 @@ from kmn_jax.train.window import MEANS, Window
 # What a resumed run may change: how long it is, where its pack lies, and what it writes when.
 _FREE = ("name", "pack", "num_steps", "validate_every", "checkpoint_every", "log_every")
 _CARRIED = ("metrics.jsonl", "sessions.jsonl", "model.safetensors")  # go with an export
+_READERS = 4  # threads that read images ahead
 _AHEAD = 2  # steps that are dispatched before the metrics of one are read
 
 
@@ -155,7 +156,10 @@ class _Run:
         self.train_step = jit_train_step(self.graphdef, optimizer, num_steps, config.step, mesh)
         self.eval_step = jit_eval_step(self.graphdef, config.step, mesh)
         self.rates = optimizer.rates(num_steps)
-        self.batches: BatchIterator[SampleIndex] = BatchIterator(self.training.batches, identity=self.training.digest)
+        read = self.training.read
+        self.batches: BatchIterator[Samples] = BatchIterator(
+            self.training.batches, read, identity=self.training.digest, threads=_READERS if read else 0
+        )
         self.checkpoints = Checkpoints(folder / "checkpoints", report=self.report)
         self.pending: deque[_Pending] = deque()
         self.stopped = ""
@@ -247,15 +251,15 @@ class _Run:
         return self.stop.reason if jax.process_count() == 1 else ""
 
     def _advance(self) -> None:
-        state, index = self.batches.get_state(), next(self.batches)
+        state, samples = self.batches.get_state(), next(self.batches)
         with jax.transfer_guard("disallow"):
             number = put_number(self.step, self.mesh)
-            batch = put_batch(index, self.mesh)
+            batch = put_batch(samples, self.mesh)
             self.state, metrics = self.train_step(self.state, self.training.pack, batch, number)
             vote = any_process(bool(self.stop.reason), self.mesh)
             for array in jax.tree.leaves(metrics):
                 array.copy_to_host_async()
-        self.pending.append(_Pending(self.step, index, state, metrics, vote))
+        self.pending.append(_Pending(self.step, index_of(samples), state, metrics, vote))
         self.step += 1
         self._settle(_AHEAD)
 

@@ -1,0 +1,60 @@
+"""Samples of depth images: the objects, deterministic reading, and labels against exact poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kmn_jax.checks import InputError
+from kmn_jax.data.crops import CropConfig
+from kmn_jax.data.pipeline import PipelineConfig, SampleBatches
+from kmn_jax.models import KeyMatchNetConfig
+from kmn_jax.train.rendered import RenderedFrames, rendered_frames
+
+FOLDER = Path(__file__).parent.parent.parent / "experiments" / "assets" / "small_test_set"
+NETWORK = KeyMatchNetConfig(num_scene_points=64, num_object_points=64, num_keypoints=4)
+
+
+@pytest.fixture(scope="module")
+def frames() -> RenderedFrames:
+    problems: list[str] = []
+    found = rendered_frames(FOLDER, "test", NETWORK, CropConfig(num_points=64, max_noise=0.0), problems.append)
+    assert problems == []
+    return found
+
+
+def test_objects_are_a_pack_without_drops(frames: RenderedFrames) -> None:
+    assert frames.names == ("000001", "000002")
+    assert frames.pack.points.shape == frames.pack.normals.shape == (2, 4096, 3)
+    assert frames.pack.T_camera_object.shape[1] == 0
+    assert 0.001 < float(frames.pack.diameter.max()) < 0.2  # metres
+    assert len(frames.digest) == 64
+
+
+def test_samples_are_points_on_the_seeds_object_in_its_pose(frames: RenderedFrames) -> None:
+    pipeline = PipelineConfig(batch_size=4, crops_per_object=2, samples_per_object=2)
+    batches = SampleBatches(pipeline, frames.num_frames, 1, ordered=True)
+    seen = set()
+    for number in range(len(batches)):
+        samples, crops = frames.read(batches[number])
+        again = frames.read(batches[number]).crops
+        assert all(np.array_equal(one, other) for one, other in zip(crops, again, strict=True))
+        for row in np.flatnonzero(samples.mask & crops.valid):
+            seen.add(int(samples.object[row]))
+            surface = np.asarray(frames.pack.points)[samples.object[row]]
+            points = crops.points[row][crops.is_object[row]]
+            T_crop_object = crops.T_crop_object[row]
+            points_object = (points - T_crop_object[:3, 3]) @ T_crop_object[:3, :3]
+            apart = np.linalg.norm(points_object[:, None] - surface[None], axis=2).min(axis=1)
+            assert apart.max() < 0.03 * frames.pack.diameter[samples.object[row]]
+            np.testing.assert_allclose(crops.points[row][0], 0, atol=1e-7)
+    assert seen == {0, 1}
+
+
+def test_a_folder_without_frames_or_objects_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError):
+        rendered_frames(tmp_path, "test", NETWORK, CropConfig(num_points=64))
+    with pytest.raises(InputError, match="train"):
+        rendered_frames(FOLDER, "train", NETWORK, CropConfig(num_points=64))
