@@ -11,7 +11,10 @@ from kmn_jax.checks import InputError
 from kmn_jax.data.crops import CropConfig
 from kmn_jax.data.pipeline import PipelineConfig, SampleBatches
 from kmn_jax.models import KeyMatchNetConfig
+from kmn_jax.train.loop import train
+from kmn_jax.train.records import read_metrics
 from kmn_jax.train.rendered import RenderedFrames, rendered_frames
+from tests.train.loop_sample import tiny
 
 FOLDER = Path(__file__).parent.parent.parent / "experiments" / "assets" / "small_test_set"
 NETWORK = KeyMatchNetConfig(num_scene_points=64, num_object_points=64, num_keypoints=4)
@@ -58,3 +61,15 @@ def test_a_folder_without_frames_or_objects_is_refused(tmp_path: Path) -> None:
         rendered_frames(tmp_path, "test", NETWORK, CropConfig(num_points=64))
     with pytest.raises(InputError, match="train"):
         rendered_frames(FOLDER, "train", NETWORK, CropConfig(num_points=64))
+
+
+def test_a_run_reads_its_crops_from_images(compiled: None, tmp_path: Path) -> None:
+    normals = {"examples.crops.normals": "estimated", "examples.crops.normal_points": 256}
+    config = tiny(rendered=str(FOLDER), rendered_split="test", num_steps=3, **normals)
+    reports: list[str] = []
+    outcome = train(config, tmp_path / "run", progress=False, report=reports.append)
+    assert (outcome.step, outcome.reason) == (3, "")
+    rows = read_metrics(tmp_path / "run")
+    assert [row["split"] for row in rows] == ["train", "validation"]
+    assert all(np.isfinite(row["loss"]) for row in rows)
+    assert not any(report.startswith("left out") for report in reports)
