@@ -1,4 +1,4 @@
-"""Make a run's best weights the released ones: `python -m experiments.release RUN`.
+"""Make a run's best weights the released ones: `python -m experiments.release RUN EVALUATION`.
 
 Writes to `kmn_jax/pretrained/`: the weights, the learning curve as CSV and as a picture, and a model card with all that
 is known of the run. Give the JSON of `experiments.evaluate_network` of the same weights for the card's tables.
@@ -33,7 +33,7 @@ class Options:
     """What is released."""
 
     run: tyro.conf.Positional[Path]  # folder of the run
-    evaluation: Path  # what `python -m experiments.evaluate_network RUN --json` wrote
+    evaluation: tyro.conf.Positional[Path]  # what `python -m experiments.evaluate_network RUN --json` wrote
     name: str | None = None  # of the released model; the run's unless given
     folder: Path = FOLDER
 
