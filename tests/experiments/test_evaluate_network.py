@@ -1,0 +1,114 @@
+"""The table of accuracies on the committed pack and images, and the release of a run's weights."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from configs import find_config
+from experiments import evaluate_network, release
+from kmn_jax.models import KeyMatchNetConfig, create_model, load_model, save_model
+
+ASSETS = Path(__file__).parent.parent.parent / "experiments" / "assets"
+NETWORK = KeyMatchNetConfig(
+    num_scene_points=64,
+    num_object_points=64,
+    num_keypoints=4,
+    num_neighbors=4,
+    edge_width=8,
+    embedding_width=16,
+    scene_width=16,
+    object_width=8,
+    pair_width=8,
+    groups=4,
+    inputs="invariant",
+    graph="static",
+)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder as a run leaves it, of a network that was never trained."""
+    folder = tmp_path_factory.mktemp("run")
+    save_model(create_model(NETWORK, jax.random.key(0)), folder / "model.safetensors")
+    config = replace(find_config("debug"), name="tiny")
+    (folder / "config.json").write_text(json.dumps(asdict(config)))
+    session = {
+        "training_objects": 4,
+        "validation_objects": 2,
+        "devices": ["cpu", "cpu"],
+        "commit": "abc",
+        "versions": {"jax": "0"},
+    }
+    (folder / "sessions.jsonl").write_text(json.dumps(session) + "\n")
+    rows = [
+        {"step": step, "samples": 8 * step, "seconds": 60.0 * step, "split": split, "loss": 3.0 - step / 100}
+        | {"segmentation_accuracy": 0.5 + step / 100, "keypoint_accuracy": step / 1000}
+        for step in (10, 20)
+        for split in ("train", "validation")
+    ]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def evaluation(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("evaluation") / "network.json"
+    arguments = [str(run), "--pack", str(ASSETS / "small_pack"), "--training-objects", "2", "--crops", "2"]
+    arguments += ["--test-sets", str(ASSETS / "small_test_set"), "--crops-a-frame", "2", "--json", str(path)]
+    assert evaluate_network.main(arguments) == 0
+    return path
+
+
+def test_every_split_and_object_is_counted(run: Path, evaluation: Path) -> None:
+    results = json.loads(evaluation.read_text())
+    assert results["sha256"] == hashlib.sha256((run / "model.safetensors").read_bytes()).hexdigest()
+    train, validation, test = results["splits"]
+    assert (train["objects"], train["crops"]) == (2, 4)
+    assert (validation["objects"], validation["crops"]) == (2, 4)
+    assert test["objects"] == 2
+    rows = results["objects"]["small_test_set"]
+    assert sum(row["crops"] for row in rows) == test["crops"]
+    for row in results["splits"]:
+        # A network that knows nothing: cross entropies of two classes and of four keypoints, weighted.
+        assert row["loss"] == pytest.approx(0.2 * np.log(2) + 0.8 * np.log(4), rel=0.2)
+        assert 0 <= row["keypoints"] <= 0.6
+    means = [sum(row["crops"] * row["loss"] for row in rows) / test["crops"]]
+    assert means[0] == pytest.approx(test["loss"], rel=1e-4)
+
+
+def test_a_release_holds_weights_curve_picture_and_card(run: Path, evaluation: Path, tmp_path: Path) -> None:
+    assert release.main([str(run), str(evaluation), "--folder", str(tmp_path)]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["tiny.csv", "tiny.md", "tiny.png", "tiny.safetensors"]
+    assert load_model(tmp_path / "tiny.safetensors").config == NETWORK
+    assert (tmp_path / "tiny.csv").read_text().splitlines()[1] == "10,80,600,train,2.9,0.6,0.01"
+    card = (tmp_path / "tiny.md").read_text()
+    for fact in ("160 seen by these weights", "keypoint accuracy 0.020", "174000 times as many", "abc", "test, small"):
+        assert fact in card, fact
+
+
+def test_a_table_of_other_weights_is_refused(
+    run: Path, evaluation: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other.json"
+    other.write_text(json.dumps(json.loads(evaluation.read_text()) | {"sha256": "0"}))
+    assert release.main([str(run), str(other), "--folder", str(tmp_path)]) == 2
+    assert "is of other weights than" in capsys.readouterr().err
+    assert list(tmp_path.glob("tiny*")) == []
+
+
+@pytest.mark.parametrize("arguments", [["nowhere.safetensors"], ["--test-sets", "nowhere"]])
+def test_what_cannot_be_read_is_one_sentence(
+    run: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = [] if len(arguments) == 1 else [str(run)]
+    assert evaluate_network.main([*model, *arguments, "--pack", "nowhere"]) == 2
+    message = capsys.readouterr().err
+    assert message.startswith("evaluate_network: ")
+    assert "nowhere" in message
