@@ -113,11 +113,11 @@ def test_resume_after_a_signal_is_bitwise(whole: tuple[Path, Outcome], tmp_path:
 def test_a_killed_and_a_terminated_process_leave_a_run_to_go_on_with(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    long = {"num_steps": 30, "validate_every": 10}
+    long = {"num_steps": 20, "validate_every": 10, "checkpoint_every": 3, "log_every": 2}
     train_quietly(tmp_path / "whole", **long)
     folder, random = tmp_path / "a run", np.random.default_rng()
     for number, fewest in ((signal.SIGKILL, 1), (signal.SIGTERM, 5)):
-        # Of 11 rows that the run writes, and at least one more than it has.
+        # Of 12 rows that the run writes, and at least one more than it has.
         rows = max(random.integers(fewest, fewest + 3), len(read_metrics(folder)) + 1)
         moment = random.uniform(0, 0.3)
         with run_train(*flags(**long), "--folder", folder, "--resume") as process:
@@ -134,7 +134,7 @@ def test_a_killed_and_a_terminated_process_leave_a_run_to_go_on_with(
     assert name.startswith("stopped after step ")
     capsys.readouterr()
     assert main(shlex.split(again)) == 0
-    assert capsys.readouterr().out.splitlines()[-1].startswith("done: 30 steps; best validation loss")
+    assert capsys.readouterr().out.splitlines()[-1].startswith("done: 20 steps; best validation loss")
     assert_same_runs(folder, tmp_path / "whole")
 
 
