@@ -163,25 +163,38 @@ def _draw_rows(
 ) -> tuple[Int[Array, " drawn"], Bool[Array, " drawn"], Int[Array, " n"]]:
     """Return rows to draw, the seed's first; which of them there are, all in front; and which become the crop.
 
-    A systematic draw without replacement: rows lie side by side, each as long as it is likely, and one point in every
-    unit of length, all at one random distance from its beginning, names a row. Of those the crop takes one at random
-    from each of as many equal stretches as it has points.
+    Both draws are in proportion to the weights, as far as no row can be drawn twice: where the many for the normals
+    include all of the heavy rows, the few of the crop still prefer them.
     """
-    start_key, stretch_key = jax.random.split(key)
+    many_key, few_key = jax.random.split(key)
     others = min(config.num_drawn, weights.shape[0]) - 1
-    likely = _likelihoods(weights.at[seed_row].set(0), others)
-    unit = min(2**16, 2**30 // max(others, 1))
-    ends = jnp.cumsum((likely * unit).astype(jnp.int32))
-    places = jax.random.randint(start_key, (), 0, unit) + unit * jnp.arange(others, dtype=jnp.int32)
-    rows = jnp.minimum(jnp.searchsorted(ends, places, side="right"), weights.shape[0] - 1).astype(jnp.int32)
+    weights = weights.at[seed_row].set(0)
+    likely = _likelihoods(weights, others)
+    rows, there = _systematic(many_key, likely, others)
+    again = jnp.where(there, weights[rows] / jnp.where(there, likely[rows], 1), 0)
+    few = min(config.num_points - 1, others)
+    chosen, _ = _systematic(few_key, _likelihoods(again, few), few)
+    total = there.sum(dtype=jnp.int32)
+    kept = jnp.where(total > few, chosen, jnp.arange(few, dtype=jnp.int32))
     rows = jnp.concatenate([seed_row[None].astype(jnp.int32), rows])
-    drawn = jnp.concatenate([found[None], places < ends[-1]])
+    return rows, jnp.concatenate([found[None], there]), jnp.concatenate([jnp.zeros(1, dtype=jnp.int32), 1 + kept])
 
-    count, total = min(config.num_points - 1, others), (places < ends[-1]).sum(dtype=jnp.int32)
-    order = jnp.arange(count, dtype=jnp.int32)
-    low, high = order * total // max(count, 1), (order + 1) * total // max(count, 1)
-    chosen = jnp.where(total > count, jax.random.randint(stretch_key, (count,), low, jnp.maximum(high, low + 1)), order)
-    return rows, drawn, jnp.concatenate([jnp.zeros(1, dtype=jnp.int32), 1 + chosen])
+
+def _systematic(
+    key: PRNGKey, likely: Float[Array, " r"], count: int
+) -> tuple[Int[Array, " count"], Bool[Array, " count"]]:
+    """Draw rows without replacement, each as likely as said, and tell which of the `count` there are.
+
+    Rows lie side by side, each as long as it is likely, and one point in every unit of length, all at one random
+    distance from its beginning, names a row.
+    """
+    if count == 0:
+        return jnp.zeros(0, dtype=jnp.int32), jnp.zeros(0, dtype=bool)
+    unit = min(2**16, 2**30 // count)
+    ends = jnp.cumsum(jnp.ceil(likely * unit).astype(jnp.int32))
+    places = jax.random.randint(key, (), 0, unit) + unit * jnp.arange(count, dtype=jnp.int32)
+    rows = jnp.minimum(jnp.searchsorted(ends, places, side="right"), likely.shape[0] - 1).astype(jnp.int32)
+    return rows, places < ends[-1]
 
 
 def _likelihoods(weights: Float[Array, " r"], count: int) -> Float[Array, " r"]:

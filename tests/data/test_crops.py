@@ -132,6 +132,27 @@ def test_points_are_drawn_in_proportion_to_the_picture_area() -> None:
     np.testing.assert_allclose(heavy, 0.75, atol=4 * np.sqrt(0.75 * 0.25 / 4000))
 
 
+def test_crops_hold_rows_in_proportion_to_the_picture_area_though_most_rows_are_drawn_for_normals() -> None:
+    # Heavy rows are all among the 600 for the normals; of the 60 of the crop they still are their share of the area.
+    total, heavy = 1000, 100
+    rng = np.random.default_rng(3)
+    visible = VisiblePoints(
+        points=jnp.asarray(rng.normal(size=(total, 3)) * 0.1 + [0, 0, 5], "f4"),
+        normals=jnp.tile(jnp.array([[0, 0, -1.0]]), (total, 1)),
+        picture_area=jnp.asarray(np.where(np.arange(total) < heavy, 9.0, 1.0), "f4"),
+        instance=jnp.asarray(np.where(np.arange(total) < heavy, 0, 1), "i4"),
+        mask=jnp.ones(total, dtype=bool),
+        visible_fraction=jnp.ones(2),
+    )
+    config = CropConfig(num_points=60, max_noise=0.0, normal_points=600, min_points=1)
+    # Seeds are on copy 0 in half of the draws, and then take one of its rows; the others say what share is of it.
+    one = jax.jit(lambda key: draw(key, visible, KEYPOINTS, POSES[:2], jnp.float32(DIAMETER), config))
+    crops = jax.lax.map(one, jax.random.split(jax.random.key(2), 300))
+    on_heavy = np.where(np.asarray(crops.instance)[:, None] == 0, crops.is_object, ~np.asarray(crops.is_object))
+    assert bool(crops.mask.all())
+    np.testing.assert_allclose(on_heavy[:, 1:].mean(), 0.5, atol=0.02)
+
+
 @pytest.mark.parametrize("config", [EXACT, CLEAN], ids=["surface", "estimated"])
 def test_fewer_points_than_asked_for_are_all_taken_and_padded(config: CropConfig) -> None:
     visible = scene(0, share=0.04, visible_fraction=np.ones(COPIES, dtype=np.float32))
