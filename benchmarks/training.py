@@ -104,18 +104,19 @@ def steps(config: TrainConfig, devices: int) -> tuple[Callable[[], Any], Callabl
     train = jit_train_step(graphdef, config.optimizer, config.num_steps, config.step, mesh)
     make = jit_make_samples(config.step, mesh)
     held = [put_whole(state, mesh)]
-    done = [0]
+    done = {"steps": 0, "batches": 0}
     memory = train.lower(held[0], source.pack, batches[0], put_number(0, mesh)).compile().memory_analysis()  # type: ignore[attr-defined]
 
     def step() -> Any:
-        number = done[0]
-        done[0] += 1
+        number = done["steps"]
+        done["steps"] += 1
         held[0], metrics = train(held[0], source.pack, batches[number % _BATCHES], put_number(number, mesh))
+        assert metrics.taken, "the step was refused: its loss is not finite"
         return metrics
 
     def data() -> Any:
-        done[0] += 1
-        return make(source.pack, batches[done[0] % _BATCHES])
+        done["batches"] += 1
+        return make(source.pack, batches[done["batches"] % _BATCHES])
 
     return step, data, int(getattr(memory, "temp_size_in_bytes", 0))
 

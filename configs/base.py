@@ -1,7 +1,7 @@
 """The published network with our recipe.
 
 Both clouds are divided by one length, inputs are rotation-invariant, crops of an object share its encoding, one dropout
-mask serves all keypoints; AdamW with warm-up and cosine, bfloat16 layers, and the running mean of the parameters.
+mask serves all keypoints; Muon with warm-up and cosine, bfloat16 layers, and the running mean of the parameters.
 
 base
     Command:   python -m experiments.train base

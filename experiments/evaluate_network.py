@@ -27,7 +27,7 @@ from kmn_jax.data.device_pack import DevicePack, stack_pack
 from kmn_jax.data.pack import Pack
 from kmn_jax.data.pipeline import PipelineConfig, SampleBatches
 from kmn_jax.models import LossConfig, Model, load_model
-from kmn_jax.report import print_table, write_json
+from kmn_jax.report import check_target, print_table, write_json
 from kmn_jax.train.examples import ExampleConfig
 from kmn_jax.train.rendered import rendered_frames
 from kmn_jax.train.sharding import data_mesh, jit_eval_step, put_batch, put_whole
@@ -62,9 +62,9 @@ class Options:
 class Evaluator:
     """One network, compiled once: sums of losses and accuracies of batches of one object's crops each."""
 
-    def __init__(self, model: Model, crops_at_once: int | None) -> None:
-        self.network = model.config
-        self.examples = ExampleConfig(crops=CropConfig(num_points=model.config.num_scene_points)).plain()
+    def __init__(self, model: Model, crops: CropConfig, loss: LossConfig, crops_at_once: int | None) -> None:
+        self.network, self._loss = model.config, loss
+        self.examples = ExampleConfig(crops=crops).plain()
         self._graphdef, self._at_once = model.graphdef, crops_at_once
         self._mesh = data_mesh(jax.devices()[:1])
         self._parameters = put_whole(model.parameters, self._mesh)
@@ -75,7 +75,7 @@ class Evaluator:
         found: dict[str, list[Sums]] = {name: [] for name in names}
         for samples in batches:
             index = index_of(samples)
-            config = StepConfig(self.network, self.examples, LossConfig(), len(index.object), self._at_once, 0.0, 0)
+            config = StepConfig(self.network, self.examples, self._loss, len(index.object), self._at_once, 0.0, 0)
             step = jit_eval_step(self._graphdef, config, self._mesh)
             sums = step(self._parameters, pack, put_batch(samples, self._mesh))
             found[names[int(index.object[0])]].append(jax.device_get(sums))
@@ -129,11 +129,18 @@ def report(problem: str) -> None:
 
 def evaluate(options: Options) -> dict[str, Any]:
     """Evaluate, print the tables, and return them with what they were made by."""
+    check_target(options.json)
     path = options.model / "model.safetensors" if options.model.is_dir() else options.model
+    digest = _digest(path)
     model = load_model(path)
-    evaluator = Evaluator(model, 1 if jax.default_backend() == "cpu" else None)
+    if _digest(path) != digest:
+        raise InputError(f"{path} changed while it was read: evaluate it again")
+    crops, loss = _settings(path.parent / "config.json", model)
+    evaluator = Evaluator(model, crops, loss, 1 if jax.default_backend() == "cpu" else None)
     splits: list[dict[str, Any]] = []
     details: dict[str, list[dict[str, Any]]] = {}
+    if not options.pack.exists() and not options.test_sets:
+        raise InputError(f"there is nothing to evaluate on: {options.pack} does not exist, and no test sets are given")
     if options.pack.exists():
         for split, most in (("train", options.training_objects), ("validation", None), ("test", None)):
             if not Pack(options.pack).names(split):
@@ -149,7 +156,6 @@ def evaluate(options: Options) -> dict[str, Any]:
     print_table("Loss and accuracies (Table I)", [*splits, *PUBLISHED])
     for name, rows in details.items():
         print_table(f"Each test object of {name} (Table II)", rows)
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
     return {
         "model": path.name,
         "sha256": digest,
@@ -158,6 +164,24 @@ def evaluate(options: Options) -> dict[str, Any]:
         "published": PUBLISHED,
         "objects": details,
     }
+
+
+def _digest(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from None
+
+
+def _settings(path: Path, model: Model) -> tuple[CropConfig, LossConfig]:
+    """Return the crops and the loss that a network was trained with: those of its run's config, else the usual ones."""
+    if not path.exists():
+        return CropConfig(num_points=model.config.num_scene_points), LossConfig()
+    try:
+        config = json.loads(path.read_text(encoding="utf-8"))
+        return CropConfig(**config["examples"]["crops"]), LossConfig(**config["loss"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} is not the config of a run ({error}): give the file of weights itself") from None
 
 
 def main(arguments: list[str] | None = None) -> int:

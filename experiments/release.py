@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import tyro
 from kmn_jax.checks import InputError
 from kmn_jax.files import write_whole
 from kmn_jax.models import load_model
-from kmn_jax.report import environment, markdown_table
+from kmn_jax.report import check_target, markdown_table
 from kmn_jax.train.records import read_metrics
 
 FOLDER = Path(__file__).parent.parent / "kmn_jax" / "pretrained"
@@ -43,7 +44,9 @@ def release(options: Options) -> list[Path]:
     source = options.run / "model.safetensors"
     model = load_model(source)
     rows = read_metrics(options.run)
-    config, evaluation = _json(options.run / "config.json"), _json(options.evaluation)
+    config = _json(options.run / "config.json", ("name", "network", "pack", "optimizer", "pipeline"))
+    evaluation = _json(options.evaluation, ("sha256", "splits", "published", "objects"))
+    sessions = _sessions(options.run / "sessions.jsonl")
     weights = source.read_bytes()
     digest = hashlib.sha256(weights).hexdigest()
     if evaluation.get("sha256") != digest:
@@ -58,22 +61,42 @@ def release(options: Options) -> list[Path]:
         raise InputError(f"{options.run} has no validation yet: nothing says which weights are the best")
     name = options.name or str(config["name"])
     paths = {kind: options.folder / f"{name}{kind}" for kind in (".safetensors", ".csv", ".png", ".md")}
-    options.folder.mkdir(parents=True, exist_ok=True)
+    check_target(paths[".md"])
     write_whole(paths[".safetensors"], weights)
     write_whole(paths[".csv"], _curve(rows).encode())
     _picture(rows, paths[".png"])
-    sessions = [json.loads(line) for line in (options.run / "sessions.jsonl").read_text().splitlines()]
     size = sum(int(leaf.size) for leaf in jax.tree.leaves(model.parameters))
     card = _card(name, config, sessions, validated, evaluation, size, digest)
     write_whole(paths[".md"], card.encode())
     return list(paths.values())
 
 
-def _json(path: Path) -> dict[str, Any]:
+def _json(path: Path, wanted: tuple[str, ...]) -> dict[str, Any]:
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
+        found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read {path} ({error})") from None
+    missing = [name for name in wanted if not isinstance(found, dict) or name not in found]
+    if missing:
+        raise InputError(f"{path} has no {', '.join(missing)}: it is another file than the one that is needed")
+    return dict(found)
+
+
+def _sessions(path: Path) -> list[dict[str, Any]]:
+    """Return what a run wrote about its sessions, without a line that was half written."""
+    sessions = []
+    try:
+        for line in path.read_text(encoding="utf-8").splitlines():
+            with suppress(ValueError):
+                sessions.append(json.loads(line))
+    except OSError as error:
+        raise InputError(f"cannot read {path} ({error.strerror})") from None
+    whole = [
+        found for found in sessions if isinstance(found, dict) and {"devices", "command", "versions"} <= found.keys()
+    ]
+    if not whole:
+        raise InputError(f"{path} tells of no session: what the weights were made by is not known")
+    return whole
 
 
 def _curve(rows: list[dict[str, Any]]) -> str:
@@ -114,8 +137,9 @@ def _card(
 ) -> str:
     best = min(validated, key=lambda row: float(row["loss"]))
     last, network = validated[-1], config["network"]
-    devices = sorted({device for session in sessions for device in session["devices"]})
-    made_by = environment()
+    devices = sorted({f"{len(each['devices'])} x {each['devices'][0]} ({_processor(each)})" for each in sessions})
+    commits = dict.fromkeys(str(each.get("commit") or "not recorded") for each in sessions)
+    commands = dict.fromkeys(" ".join([Path(each["command"][0]).stem, *each["command"][1:]]) for each in sessions)
     facts = {
         "Weights": f"`{name}.safetensors`, {parameters:,} parameters, SHA-256 `{digest[:16]}…`",
         "Network": f"N = {network['num_scene_points']} scene points, M = {network['num_object_points']} object points,"
@@ -129,11 +153,9 @@ def _card(
         "Optimizer": f"{config['optimizer']['method']}, rate {config['optimizer']['learning_rate']},"
         f" {config['optimizer']['schedule']} schedule, batch {config['pipeline']['batch_size']}, mean of parameters"
         f" with decay {config['average_decay']}",
-        "Time": f"{best['seconds'] / 3600:.1f} hours until then, on {len(sessions[-1]['devices'])} x"
-        f" {', '.join(devices)} ({made_by['processor']}, {made_by['cores']} cores), other work beside it",
-        "Command": f"`python -m experiments.train {config['name']}`, then `python -m experiments.release`",
-        "Commits": ", ".join(sorted({str(session["commit"]) for session in sessions if session["commit"]}))
-        or "unknown",
+        "Time": f"{best['seconds'] / 3600:.1f} hours until then, on {', '.join(devices)}",
+        "Commands": "; ".join(f"`python -m experiments.{command}`" for command in commands),
+        "Commits": ", ".join(commits) + ", of the sessions in turn",
         "Versions": ", ".join(f"{key} {value}" for key, value in sessions[-1]["versions"].items()),
         "Validation": f"loss {best['loss']:.3f}, segmentation accuracy {best['segmentation_accuracy']:.3f}, keypoint"
         f" accuracy {best['keypoint_accuracy']:.3f}; selected by the loss",
@@ -143,7 +165,7 @@ def _card(
     parts.append("## Loss and accuracies\n\nPublished rows are of the authors' data, not of ours.")
     parts.append(markdown_table([*evaluation["splits"], *evaluation["published"]]))
     for folder, rows in evaluation["objects"].items():
-        parts.append(f"## Test objects: {folder}\n\n{markdown_table(rows)}")
+        parts.append(f"## Test objects: {folder}\n\n{markdown_table(rows) if rows else 'None.'}")
     parts.append(
         "## What it leaves on the table\n\n"
         f"Keypoint accuracy on validation objects went from {validated[0]['keypoint_accuracy']:.3f} after"
@@ -151,6 +173,10 @@ def _card(
         " curve for whether it still rises. The published accuracy took many more samples."
     )
     return "\n\n".join(parts) + "\n"
+
+
+def _processor(session: dict[str, Any]) -> str:
+    return f"{session['processor']}, {session['cores']} cores" if "processor" in session else "processor not recorded"
 
 
 def main(arguments: list[str] | None = None) -> int:

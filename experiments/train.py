@@ -47,7 +47,8 @@ def main(arguments: list[str] | None = None) -> int:
         options = _parse(name, rest)
         folder = options.folder or Path("runs") / name
         if not initialize_distributed(options.coordinator, options.processes, options.process):
-            split_cpu(options.config.pipeline.groups_per_batch)
+            pipeline, at_once = options.config.pipeline, options.config.crops_at_once
+            split_cpu(pipeline.batch_size // max(pipeline.crops_per_object, at_once or 1))
         outcome = train(
             options.config,
             folder,

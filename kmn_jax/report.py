@@ -16,6 +16,8 @@ from typing import Any
 
 import jax
 
+from kmn_jax.checks import InputError
+
 
 def environment() -> dict[str, Any]:
     """Return device, versions, commit, date and command."""
@@ -29,10 +31,10 @@ def environment() -> dict[str, Any]:
     return {
         "device": str(jax.devices()[0].device_kind),
         "platform": jax.default_backend(),
-        "processor": _processor(),
+        "processor": processor(),
         "cores": os.cpu_count(),
         "versions": versions,
-        "commit": _commit(),
+        "commit": commit(),
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "command": " ".join(["python -m", _module(), *sys.argv[1:]]),
     }
@@ -59,9 +61,19 @@ def write_json(path: Path | None, results: Mapping[str, Any]) -> None:
     """Write results and environment to `path`, if there is one."""
     if path is None:
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
+    check_target(path)
     path.write_text(json.dumps({"environment": environment(), **results}, indent=1, default=_plain) + "\n")
     print(f"\nwrote {path}")
+
+
+def check_target(path: Path | None) -> None:
+    """Make the folder of a file that is to be written; call it before what takes time. Raises InputError."""
+    if path is None:
+        return
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make the folder {path.parent}: {error.strerror}") from None
 
 
 def _plain(value: Any) -> Any:
@@ -76,7 +88,8 @@ def _format(value: Any) -> str:
     return str(value)
 
 
-def _processor() -> str:
+def processor() -> str:
+    """Return the name of this machine's processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -84,18 +97,14 @@ def _processor() -> str:
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
-def _commit() -> str:
+def commit() -> str | None:
+    """Return the commit of the checkout that this code runs from, marked if files differ; None outside of one."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
     try:
-        result = subprocess.run(
-            ["git", "describe", "--always", "--dirty"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return result.stdout.strip()
+        result = subprocess.run(command, capture_output=True, text=True, timeout=20)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return result.stdout.strip() if result.returncode == 0 else None
 
 
 def _module() -> str:

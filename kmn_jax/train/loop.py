@@ -32,7 +32,7 @@ from kmn_jax.files import write_whole
 from kmn_jax.models import save_model
 from kmn_jax.train.checkpoint import Checkpoints
 from kmn_jax.train.config import TrainConfig
-from kmn_jax.train.records import MetricFiles, check_config, write_config, write_session
+from kmn_jax.train.records import MetricFiles, check_config, check_same, write_config, write_session
 from kmn_jax.train.sharding import (
     any_process,
     check_batch,
@@ -118,14 +118,14 @@ def _check(
     folder: Path, config: TrainConfig, resume: bool, import_from: str | Path | None, export_to: str | Path | None
 ) -> None:
     """See that the folder holds this run or none, before anything takes time."""
-    exists = (folder / "config.json").exists()
+    exists = any((folder / "checkpoints").glob("*"))  # without one there is nothing to lose
     if exists and import_from is not None:
         raise InputError(f"{folder} holds a run already: resume it without importing, or import into another folder")
     if exists and not resume:
         raise InputError(f"{folder} holds a run: resume it, or choose another folder")
     if export_to is not None and (Path(export_to) / MANIFEST).exists():
         raise InputError(f"{export_to} holds an export already: choose another folder to export to")
-    if exists:
+    if exists and (folder / "config.json").exists():
         check_config(folder, asdict(config), _FREE)
     if export_to is not None:
         _make_folder(Path(export_to))
@@ -147,7 +147,8 @@ class _Run:
         self.report = report if self.first else _ignore
         size = config.pipeline.batch_size
         check_batch(size, config.step, mesh)
-        self.training, self.validation = training_source(config, mesh), validation_source(config, mesh)
+        self.training = training_source(config, mesh, lambda problem: self.report(f"left out: {problem}"))
+        self.validation = validation_source(config, mesh)
         for problem in (*self.training.problems, *self.validation.problems):
             self.report(f"left out: {problem}")
         optimizer, num_steps = config.optimizer, config.num_steps
@@ -158,7 +159,7 @@ class _Run:
         self.rates = optimizer.rates(num_steps)
         read = self.training.read
         self.batches: BatchIterator[Samples] = BatchIterator(
-            self.training.batches, read, identity=self.training.digest, threads=_READERS if read else 0
+            self.training.batches, read, self.training.digest, threads=_READERS if read else 0, ahead=_READERS
         )
         self.checkpoints = Checkpoints(folder / "checkpoints", report=self.report)
         self.pending: deque[_Pending] = deque()
@@ -175,6 +176,8 @@ class _Run:
         if found is None:
             from_first_process(self._check_none)
         _make_folder(self.folder)
+        if found is not None and import_from is None:
+            check_same(f"{self.folder}", found.facts.get("config", {}), asdict(self.config), _FREE)
         if found is not None:
             self._take(found)
             self.report(f"going on at step {self.step} of {self.config.num_steps}")
@@ -328,6 +331,7 @@ class _Run:
 
     def _snapshot(self) -> Snapshot:
         facts = {
+            "config": json.loads(json.dumps(asdict(self.config))),
             "step": self.step,
             "samples": self.step * self.config.pipeline.batch_size,
             "seconds": self._seconds(),

@@ -6,8 +6,8 @@ import csv
 import io
 import json
 import math
+import os
 import platform
-import subprocess
 import sys
 import time
 from collections.abc import Mapping
@@ -20,6 +20,7 @@ import jax
 
 from kmn_jax.checks import InputError
 from kmn_jax.files import write_whole
+from kmn_jax.report import commit, processor
 from kmn_jax.train.events import EventFile
 
 COLUMNS = (
@@ -102,13 +103,21 @@ def check_config(folder: Path, config: Mapping[str, Any], free: tuple[str, ...] 
     """
     path = folder / "config.json"
     try:
-        old = _flat(json.loads(path.read_text(encoding="utf-8")))
-    except (AttributeError, ValueError) as error:
+        old = dict(json.loads(path.read_text(encoding="utf-8")))
+    except (AttributeError, TypeError, ValueError) as error:
         raise InputError(f"{path} is broken ({error}): restore it, or choose another folder") from None
-    new = _flat(json.loads(json.dumps(config)))
-    changed = [name for name in sorted({*old, *new}) if old.get(name) != new.get(name) and name not in free]
+    check_same(f"{folder}", old, config, free)
+
+
+def check_same(folder: str, old: Mapping[str, Any], new: Mapping[str, Any], free: tuple[str, ...] = ()) -> None:
+    """Raise InputError if the config of a run differs from a new one in more than the `free` names.
+
+    Names that the old one lacks, because an earlier version knew none of them, are passed over.
+    """
+    old, new = _flat(dict(old)), _flat(json.loads(json.dumps(new)))
+    changed = [name for name in sorted(old) if old[name] != new.get(name) and name not in free]
     if changed:
-        what = ", ".join(f"{name} = {old.get(name)}, not {new.get(name)}" for name in changed[:4])
+        what = ", ".join(f"{name} = {old[name]}, not {new.get(name)}" for name in changed[:4])
         raise InputError(f"{folder} holds a run with {what}: resume with the same values, or choose another folder")
 
 
@@ -122,20 +131,12 @@ def write_session(folder: Path, step: int, facts: Mapping[str, Any]) -> None:
         "commit": commit(),
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}},
         "devices": [device.device_kind for device in jax.devices()],
+        "processor": processor(),
+        "cores": os.cpu_count(),
         "processes": jax.process_count(),
     }
     with (folder / "sessions.jsonl").open("a", encoding="utf-8") as file:
         file.write(json.dumps(session) + "\n")
-
-
-def commit() -> str | None:
-    """Return the commit of the checkout that this code runs from, marked if files differ; None outside of one."""
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
-    try:
-        result = subprocess.run(command, capture_output=True, text=True, timeout=20)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return result.stdout.strip() if result.returncode == 0 else None
 
 
 def _version(name: str) -> str | None:

@@ -74,8 +74,8 @@ def initialize_distributed(
     return True
 
 
-def split_cpu(groups: int) -> None:
-    """Make every core of a CPU a device of its own, or as many as can share a batch of so many groups.
+def split_cpu(shares: int) -> None:
+    """Make every core of a CPU a device of its own, or as many as can take equal numbers of so many shares of a batch.
 
     Two devices of a core each are nearly twice as fast as one of two cores. Call it before JAX is used for anything
     else. Other accelerators are what they are; so are devices that XLA_FLAGS or a setting of JAX asks for.
@@ -84,7 +84,7 @@ def split_cpu(groups: int) -> None:
     if flag in os.environ.get("XLA_FLAGS", "") or jax.config.values["jax_num_cpu_devices"] > 0:
         return
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    jax.config.update("jax_num_cpu_devices", max(n for n in range(1, cores + 1) if groups % n == 0))
+    jax.config.update("jax_num_cpu_devices", max(n for n in range(1, cores + 1) if shares % n == 0))
 
 
 def data_mesh(devices: Sequence[jax.Device] | None = None) -> Mesh:

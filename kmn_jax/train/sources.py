@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
+from kmn_jax.checks import InputError
 from kmn_jax.data.device_pack import DevicePack, StackedPack, stack_pack
 from kmn_jax.data.pack import Pack
 from kmn_jax.data.pipeline import PipelineConfig, SampleBatches, SampleIndex
@@ -32,23 +33,38 @@ class Source:
     read: Callable[[SampleIndex], Samples] | None = None  # makes a batch on the host, if the steps do not
 
 
-def training_source(config: TrainConfig, mesh: Mesh) -> Source:
-    """Return the training objects, or the configured share of them, and their endless samples."""
+def training_source(config: TrainConfig, mesh: Mesh, report: Callable[[str], None] | None = None) -> Source:
+    """Return the training objects, or the configured share of them, and their endless samples.
+
+    Problems of images that are found while they are read go to `report`.
+    """
     if config.rendered is not None:
-        return _rendered_source(config, config.rendered, mesh)
+        return _rendered_source(config, config.rendered, mesh, report)
     pack = Pack(config.pack)
     names = pack.names("train")
     count = max(1, round(config.training_share * len(names)))
     chosen = [names[row * len(names) // count] for row in range(min(count, len(names)))]
     stacked = stack_pack(pack, chosen if names else "train", _with_bits(config))
+    _check_surfels(config, stacked)
     return _source(stacked, config.pipeline, mesh, ordered=False)
 
 
 def validation_source(config: TrainConfig, mesh: Mesh) -> Source:
     """Return the validation objects and their fixed samples, in order, as one pass."""
     stacked = stack_pack(Pack(config.pack), "validation", _with_bits(config))
+    _check_surfels(config, stacked)
     pipeline = replace(config.pipeline, samples_per_object=config.validation_samples, seed=_VALIDATION_SEED)
     return _source(stacked, pipeline, mesh, ordered=True)
+
+
+def _check_surfels(config: TrainConfig, stacked: StackedPack) -> None:
+    """See before anything is written that the steps can be compiled."""
+    found, needed = stacked.arrays.points.shape[1], config.network.num_object_points
+    if found < needed:
+        raise InputError(
+            f"the pack {config.pack} has {found} surfels an object, but network.num_object_points = {needed}: choose"
+            " fewer, or build a pack with more"
+        )
 
 
 def _with_bits(config: TrainConfig) -> bool:
@@ -67,10 +83,9 @@ def _source(stacked: StackedPack, pipeline: PipelineConfig, mesh: Mesh, ordered:
     return Source(put_whole(stacked.arrays, mesh), stacked.names, stacked.digest, batches, stacked.problems)
 
 
-def _rendered_source(config: TrainConfig, folder: str, mesh: Mesh) -> Source:
-    problems: list[str] = []
-    frames = rendered_frames(folder, config.rendered_split, config.network, config.examples.crops, problems.append)
+def _rendered_source(config: TrainConfig, folder: str, mesh: Mesh, report: Callable[[str], None] | None) -> Source:
+    frames = rendered_frames(folder, config.rendered_split, config.network, config.examples.crops, report)
     batches = SampleBatches(
         config.pipeline, frames.num_frames, 1, shard_index=jax.process_index(), shard_count=jax.process_count()
     )
-    return Source(put_whole(frames.pack, mesh), frames.names, frames.digest, batches, tuple(problems), frames.read)
+    return Source(put_whole(frames.pack, mesh), frames.names, frames.digest, batches, (), frames.read)

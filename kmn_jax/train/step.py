@@ -288,6 +288,9 @@ def _part_sums(
     part: _Part,
 ) -> Sums:
     network = nnx.merge(graphdef, parameters)
+    # Crops that do not count may have no points, of which a maximum and its gradient are not finite: their padding is
+    # taken for points.
+    part = part._replace(mask=part.mask | (part.weight == 0)[..., None])
 
     def of_group(features: Float[Array, "k o"], length: Float[Array, ""], part: _Part) -> MatchingLoss:
         def one(crop, mask, is_object, keypoint, key):  # type: ignore[no-untyped-def]

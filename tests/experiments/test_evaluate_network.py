@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -37,16 +38,19 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder as a run leaves it, of a network that was never trained."""
     folder = tmp_path_factory.mktemp("run")
     save_model(create_model(NETWORK, jax.random.key(0)), folder / "model.safetensors")
-    config = replace(find_config("debug"), name="tiny")
+    debug = find_config("debug")
+    crops = replace(debug.examples.crops, num_points=64)
+    config = replace(debug, name="tiny", network=NETWORK, examples=replace(debug.examples, crops=crops))
     (folder / "config.json").write_text(json.dumps(asdict(config)))
     session = {
         "training_objects": 4,
         "validation_objects": 2,
         "devices": ["cpu", "cpu"],
         "commit": "abc",
+        "command": ["experiments/train.py", "small", "--seed", "1"],
         "versions": {"jax": "0"},
     }
-    (folder / "sessions.jsonl").write_text(json.dumps(session) + "\n")
+    (folder / "sessions.jsonl").write_text(json.dumps(session) + '\n{"half a li')
     rows = [
         {"step": step, "samples": 8 * step, "seconds": 60.0 * step, "split": split, "loss": 3.0 - step / 100}
         | {"segmentation_accuracy": 0.5 + step / 100, "keypoint_accuracy": step / 1000}
@@ -89,7 +93,14 @@ def test_a_release_holds_weights_curve_picture_and_card(run: Path, evaluation: P
     assert load_model(tmp_path / "tiny.safetensors").config == NETWORK
     assert (tmp_path / "tiny.csv").read_text().splitlines()[1] == "10,80,600,train,2.9,0.6,0.01"
     card = (tmp_path / "tiny.md").read_text()
-    for fact in ("160 seen by these weights", "keypoint accuracy 0.020", "174000 times as many", "abc", "test, small"):
+    for fact in (
+        "160 seen by these weights",
+        "keypoint accuracy 0.020",
+        "174000 times as many",
+        "abc",
+        "test, small",
+        "experiments.train small --seed 1",
+    ):
         assert fact in card, fact
 
 
@@ -101,6 +112,37 @@ def test_a_table_of_other_weights_is_refused(
     assert release.main([str(run), str(other), "--folder", str(tmp_path)]) == 2
     assert "is of other weights than" in capsys.readouterr().err
     assert list(tmp_path.glob("tiny*")) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("sessions.jsonl", None, "cannot read"),
+        ("sessions.jsonl", "half a line", "tells of no session"),
+        ("config.json", "{}", "has no name, network"),
+        ("metrics.jsonl", "", "has no validation yet"),
+        ("network.json", "[1]", "has no sha256"),
+    ],
+)
+def test_a_broken_run_is_not_released(
+    run: Path,
+    evaluation: Path,
+    tmp_path: Path,
+    name: str,
+    content: str | None,
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    shutil.copyfile(evaluation, folder / "network.json")
+    (folder / name).unlink()
+    if content is not None:
+        (folder / name).write_text(content)
+    arguments = [str(folder), str(folder / "network.json"), "--folder", str(tmp_path / "released")]
+    assert release.main(arguments) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.glob("released/*"))
 
 
 @pytest.mark.parametrize("arguments", [["nowhere.safetensors"], ["--test-sets", "nowhere"]])

@@ -224,6 +224,24 @@ def test_no_time_left_saves_and_an_export_goes_on_elsewhere(
     assert_same_states(there, whole[0])
 
 
+def test_checkpoints_know_their_config(whole: tuple[Path, Outcome], tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(whole[0], folder)
+    (folder / "config.json").unlink()
+    with pytest.raises(InputError, match="holds a run: resume it"):
+        train(tiny(), folder)
+    with pytest.raises(InputError, match="holds a run with seed = 0, not 1"):
+        train(tiny(seed=1), folder, resume=True)
+
+
+def test_a_run_that_cannot_begin_leaves_its_folder_free(tmp_path: Path) -> None:
+    config = tiny(**{"network.num_object_points": 8192})
+    for _ in range(2):
+        with pytest.raises(InputError, match="has 4096 surfels an object, but network.num_object_points = 8192"):
+            train(config, tmp_path / "run", progress=False)
+    assert not (tmp_path / "run" / "config.json").exists()
+
+
 def test_a_step_that_is_not_finite_stops_the_run(
     whole: tuple[Path, Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -270,5 +288,5 @@ def test_a_step_that_is_not_finite_stops_the_run(
     again.mkdir()
     shutil.copytree(folder / "nan" / "checkpoints", again / "checkpoints")
     shutil.copyfile(folder / "model.safetensors", again / "model.safetensors")
-    assert train_quietly(again).step == 6
+    assert train_quietly(again, resume=True).step == 6
     assert_same_states(again, whole[0])

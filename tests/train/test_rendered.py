@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,8 @@ from tests.train.loop_sample import tiny
 
 FOLDER = Path(__file__).parent.parent.parent / "experiments" / "assets" / "small_test_set"
 NETWORK = KeyMatchNetConfig(num_scene_points=64, num_object_points=64, num_keypoints=4)
+
+NORMALS = {"examples.crops.normals": "estimated", "examples.crops.normal_points": 256}
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +67,7 @@ def test_a_folder_without_frames_or_objects_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_run_reads_its_crops_from_images(compiled: None, tmp_path: Path) -> None:
-    normals = {"examples.crops.normals": "estimated", "examples.crops.normal_points": 256}
-    config = tiny(rendered=str(FOLDER), rendered_split="test", num_steps=3, **normals)
+    config = tiny(rendered=str(FOLDER), rendered_split="test", num_steps=3, **NORMALS)
     reports: list[str] = []
     outcome = train(config, tmp_path / "run", progress=False, report=reports.append)
     assert (outcome.step, outcome.reason) == (3, "")
@@ -73,3 +75,16 @@ def test_a_run_reads_its_crops_from_images(compiled: None, tmp_path: Path) -> No
     assert [row["split"] for row in rows] == ["train", "validation"]
     assert all(np.isfinite(row["loss"]) for row in rows)
     assert not any(report.startswith("left out") for report in reports)
+
+
+def test_a_broken_image_is_named_and_the_run_goes_on(compiled: None, tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    shutil.copytree(FOLDER, folder)
+    for image in sorted(folder.glob("test/000001/depth/*.png")):
+        image.write_bytes(image.read_bytes()[:-100])
+    config = tiny(rendered=str(folder), rendered_split="test", num_steps=3, **NORMALS)
+    reports: list[str] = []
+    outcome = train(config, tmp_path / "run", progress=False, report=reports.append)
+    assert (outcome.step, outcome.reason) == (3, "")
+    assert all(np.isfinite(row["gradient_norm"]) for row in read_metrics(tmp_path / "run") if row["split"] == "train")
+    assert any(report.startswith("left out") and "000001" in report for report in reports)
