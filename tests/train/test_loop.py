@@ -237,7 +237,7 @@ def test_checkpoints_know_their_config(whole: tuple[Path, Outcome], tmp_path: Pa
 def test_a_run_that_cannot_begin_leaves_its_folder_free(tmp_path: Path) -> None:
     config = tiny(**{"network.num_object_points": 8192})
     for _ in range(2):
-        with pytest.raises(InputError, match="has 4096 surfels an object, but network.num_object_points = 8192"):
+        with pytest.raises(InputError, match=r"has 4096 surfels an object, but network.num_object_points = 8192"):
             train(config, tmp_path / "run", progress=False)
     assert not (tmp_path / "run" / "config.json").exists()
 
