@@ -18,7 +18,7 @@ from kmn_jax.train.optimizer import OptimizerConfig
 small = TrainConfig(
     name="small",
     pack="outputs/packs/electronics",
-    num_steps=10_000,
+    num_steps=20_000,
     network=KeyMatchNetConfig(
         num_scene_points=512,
         num_object_points=512,
