@@ -1,0 +1,116 @@
+"""Poses against the measured surface: what of an object's visible side the scan confirms, and what it contradicts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from kmn_jax.data.splat import Intrinsics, SplatConfig, Surfels, visible_by_splatting
+from kmn_jax.typing import Pose, Scalar
+
+
+@dataclass(frozen=True)
+class VerifyConfig:
+    """Set the comparison; the tolerance is a share of the object's diameter."""
+
+    tolerance: float = 0.03  # between predicted and measured depth
+    window: int = 1  # pixels to each side in which a measurement may lie: edges are off by one
+    splat: SplatConfig = field(default_factory=lambda: SplatConfig(resolution=128))
+
+    def __post_init__(self) -> None:
+        """Refuse values that contradict their meaning."""
+        if not self.tolerance > 0 or self.window < 0:
+            raise ValueError(f"tolerance = {self.tolerance} must be above zero and window = {self.window} not below it")
+
+
+class Agreement(NamedTuple):
+    """Shares of the picture area that an object at a pose would cover if nothing hid it; they sum up to 1.
+
+    Missing measurements, as on shiny flanks, speak neither for nor against a pose.
+    """
+
+    explained: Scalar  # measured where it is predicted
+    violated: Scalar  # the sensor saw through it: something was measured behind
+    occluded: Scalar  # something was measured in front
+    unknown: Scalar  # nothing was measured
+
+
+def agreement(
+    T_camera_object: Pose,
+    surfels: Surfels,
+    depth: Float[Array, "h w"],
+    camera: Intrinsics,
+    diameter: Scalar,
+    config: VerifyConfig,
+) -> Agreement:
+    """Compare an object at a pose with a depth image in the same unit, zero where nothing was measured."""
+    seen = visible_by_splatting(surfels, T_camera_object[None], jnp.ones(1, dtype=bool), camera, None, config.splat)
+    x, y, z = (seen.points[:, axis] for axis in range(3))
+    safe = jnp.where(seen.mask, z, 1)
+    column = jnp.round(camera.fx * x / safe + camera.cx).astype(jnp.int32)
+    row = jnp.round(camera.fy * y / safe + camera.cy).astype(jnp.int32)
+    measured = _window(depth, row, column, config.window)
+    there = measured > 0
+    gap = jnp.where(there, measured - z[:, None], 0)
+    tolerance = config.tolerance * diameter
+    near = (there & (jnp.abs(gap) <= tolerance)).any(axis=1)
+    some = there.any(axis=1)
+    behind = (~there | (gap > tolerance)).all(axis=1)
+    weight = jnp.where(seen.mask, seen.picture_area, 0)
+    weight = weight / jnp.maximum(weight.sum(), jnp.finfo(jnp.float32).tiny)
+
+    def share(which: Bool[Array, " m"]) -> Scalar:
+        return jnp.where(which, weight, 0).sum()
+
+    return Agreement(
+        explained=share(near),
+        violated=share(some & behind & ~near),
+        occluded=share(some & ~behind & ~near),
+        unknown=share(~some),
+    )
+
+
+def _window(
+    depth: Float[Array, "h w"], row: Int[Array, " m"], column: Int[Array, " m"], reach: int
+) -> Float[Array, "m k"]:
+    """Return the measurements around a pixel; zero outside of the image."""
+    height, width = depth.shape
+    steps = [(u, v) for u in range(-reach, reach + 1) for v in range(-reach, reach + 1)]
+    values = []
+    for u, v in steps:
+        r, c = row + u, column + v
+        inside = (r >= 0) & (r < height) & (c >= 0) & (c < width)
+        values.append(jnp.where(inside, depth[jnp.clip(r, 0, height - 1), jnp.clip(c, 0, width - 1)], 0))
+    return jnp.stack(values, axis=1)
+
+
+def depth_buffer(
+    points: Float[Array, "r 3"], mask: Bool[Array, " r"], camera: Intrinsics, shape: tuple[int, int]
+) -> Float[Array, "h w"]:
+    """Return the depth image that a camera at the origin would have of points: the nearest one of every pixel."""
+    height, width = shape
+    x, y, z = (points[:, axis] for axis in range(3))
+    ahead = mask & (z > 0)
+    safe = jnp.where(ahead, z, 1)
+    column = jnp.round(camera.fx * x / safe + camera.cx).astype(jnp.int32)
+    row = jnp.round(camera.fy * y / safe + camera.cy).astype(jnp.int32)
+    inside = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    index = jnp.where(inside, row * width + column, height * width)
+    nearest = jnp.full(height * width, jnp.inf).at[index].min(jnp.where(inside, z, jnp.inf), mode="drop")
+    return jnp.where(jnp.isfinite(nearest), nearest, 0).reshape(height, width)
+
+
+def agreements(
+    poses: Float[Array, "s 4 4"],
+    surfels: Surfels,
+    depth: Float[Array, "h w"],
+    camera: Intrinsics,
+    diameter: Scalar,
+    config: VerifyConfig,
+) -> Agreement:
+    """Return the agreement of several poses."""
+    return jax.lax.map(lambda pose: agreement(pose, surfels, depth, camera, diameter, config), poses)

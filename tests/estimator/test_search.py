@@ -1,0 +1,115 @@
+"""The search as a function of scene, seeds and key: spread, padding, determinism; nothing is ever NaN."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kmn_jax.estimator.search import (
+    Hypotheses,
+    PartArrays,
+    SceneArrays,
+    SearchConfig,
+    part_arrays,
+    search,
+    spread_seeds,
+)
+from kmn_jax.models import KeyMatchNetConfig, Model, create_model, encode_object
+from kmn_jax.pose import RansacConfig
+from tests.reference.clouds import box_cloud
+
+NETWORK = KeyMatchNetConfig(
+    num_scene_points=64,
+    num_object_points=64,
+    num_keypoints=6,
+    num_neighbors=4,
+    edge_width=8,
+    embedding_width=16,
+    scene_width=16,
+    object_width=8,
+    pair_width=8,
+    groups=4,
+    graph="static",
+    inputs="invariant",
+)
+CONFIG = SearchConfig(ransac=RansacConfig(num_hypotheses=50, num_candidates=200), normal_points=256)
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return create_model(NETWORK, jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def part(model: Model) -> PartArrays:
+    cloud = box_cloud(0, 128).astype(np.float32)
+    features = encode_object(model, cloud[:64], np.arange(6), np.float32(2)).features
+    return part_arrays(jnp.asarray(cloud[:, :3]), jnp.asarray(cloud[:, 3:]), features, jnp.float32(2), 64)
+
+
+def scene(count: int = 700, capacity: int = 1024, seed: int = 0) -> SceneArrays:
+    rng = np.random.default_rng(seed)
+    points = np.zeros((capacity, 3), dtype=np.float32)
+    points[:count] = rng.uniform(-2, 2, (count, 3)) * [1, 1, 0.2] + [0, 0, 6]
+    return SceneArrays(jnp.asarray(points), jnp.arange(capacity) < count)
+
+
+def run(model: Model, part: PartArrays, where: SceneArrays, seeds: list[int], key: int = 0) -> Hypotheses:
+    return search(
+        model.graphdef, model.parameters, part, where, jnp.asarray(seeds, "i4"), jax.random.key(key), CONFIG, 64
+    )
+
+
+def test_seeds_are_candidates_far_from_each_other() -> None:
+    where = scene()
+    candidates = jnp.asarray(np.asarray(where.points)[:, 0] > 0)
+    found, real = spread_seeds(where, candidates, 12)
+    seeds = np.asarray(found)
+    assert bool(real.all())
+    assert bool(candidates[seeds].all())
+    assert bool(where.mask[seeds].all())
+    points = np.asarray(where.points)[seeds]
+    apart = np.linalg.norm(points[:, None] - points[None], axis=2)[~np.eye(12, dtype=bool)]
+    chosen = np.asarray(where.points)[np.flatnonzero(candidates & where.mask)]
+    holes = np.linalg.norm(chosen[:, None] - points[None], axis=2).min(axis=1).max()
+    assert apart.min() >= 0.9 * holes
+
+
+def test_few_candidates_come_again_and_are_told() -> None:
+    where = scene()
+    candidates = jnp.zeros(1024, dtype=bool).at[jnp.array([3, 500])].set(True)
+    seeds, real = spread_seeds(where, candidates, 5)
+    assert set(np.asarray(seeds).tolist()) == {3, 500}
+    assert set(np.asarray(seeds)[np.asarray(real)].tolist()) == {3, 500}
+    assert int(real.sum()) == 2
+    assert not bool(spread_seeds(where, jnp.zeros(1024, dtype=bool), 5)[1].any())
+
+
+def test_hypotheses_are_finite_and_those_of_their_key(model: Model, part: PartArrays) -> None:
+    where = scene()
+    found = run(model, part, where, [0, 10, 200])
+    for name, value in found._asdict().items():
+        assert value.shape[0] == 3
+        assert bool(jnp.isfinite(value).all()), name
+    again = run(model, part, where, [0, 10, 200])
+    for one, other in zip(found, again, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert np.allclose(np.linalg.det(np.asarray(found.T_scene_object)[:, :3, :3]), 1, atol=1e-4)
+    assert bool((found.object_share <= 1).all())
+
+
+def test_a_seed_among_nothing_gives_no_pose(model: Model, part: PartArrays) -> None:
+    points = jnp.zeros((1024, 3)).at[:, 2].set(1.0).at[0].set(jnp.array([50.0, 0, 1]))
+    found = run(model, part, SceneArrays(points, jnp.arange(1024) < 1), [0, 0, 0])
+    assert not bool(found.found.any())
+    assert bool(jnp.isfinite(found.T_scene_object).all())
+
+
+def test_padding_changes_nothing(model: Model, part: PartArrays) -> None:
+    where = scene()
+    rubbish = jnp.where(where.mask[:, None], where.points, 6.0)
+    one, other = (run(model, part, where._replace(points=points), [5, 9, 60]) for points in (where.points, rubbish))
+    for name in one._fields:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
