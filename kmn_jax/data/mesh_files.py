@@ -63,7 +63,7 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     if own and unit not in (None, own):
         raise InputError(f"{path}: {suffix} files are read in metres, so the unit cannot be {unit}: leave it out")
     unit = check_unit((own or "mm") if unit is None else unit)
-    content = _read(path)
+    content = read_file(path)
     try:
         vertices, normals, triangles = _parse(content, suffix)
         if len(triangles) == 0 and suffix not in CLOUD_SUFFIXES:
@@ -76,17 +76,27 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     return Mesh(vertices, triangles.astype(np.int32), None if len(triangles) else normals, unit)
 
 
-def _read(path: Path) -> bytes:
+def parse_points(content: bytes, suffix: str) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the points of a PLY, PCD or XYZ file's content, as they are, and their normals if it has any.
+
+    Raises InputError, without the file's name, if it is not of that format or truncated.
+    """
+    points, normals, _ = _parse(content, suffix)
+    return points, normals
+
+
+def read_file(path: Path, what: str = "a CAD file") -> bytes:
+    """Return the content of a file, or raise InputError if it is missing, not a file, or empty."""
     try:
         if path.exists() and not path.is_file():
-            raise InputError(f"{path} is {'a folder' if path.is_dir() else 'not a regular file'}: name a CAD file")
+            raise InputError(f"{path} is {'a folder' if path.is_dir() else 'not a regular file'}: name {what}")
         content = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
     except ValueError as error:  # a null character
         raise InputError(f"{str(path)!r} cannot be read: {error}") from None
     if not content:
-        raise InputError(f"{path} is empty (0 bytes): name a CAD file")
+        raise InputError(f"{path} is empty (0 bytes): name {what}")
     return content
 
 
