@@ -1,0 +1,107 @@
+"""The scan as its sensor saw it: points in a frame whose origin is the sensor, and a depth image in that frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from kmn_jax.checks import InputError
+from kmn_jax.data.scan_files import Scan
+from kmn_jax.data.scene import Camera
+from kmn_jax.data.splat import Intrinsics
+from kmn_jax.estimator.verify import depth_buffer
+
+_LARGEST = 1024  # pixels along a side of an image that is made of a cloud
+_SAMPLE = 2000  # points whose spacing is measured
+_NEAREST = 1e-3  # of the distance of the cloud: a sensor nearer than that to a point lies in the cloud
+
+
+@dataclass(frozen=True)
+class View:
+    """Points and depth in the sensor's frame, z forward, lengths in the scan's unit."""
+
+    T_scene_view: Float[np.ndarray, "4 4"]
+    points: Float32[np.ndarray, "n 3"]
+    depth: Float32[np.ndarray, "h w"]  # zero where nothing was measured
+    camera: Camera
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """The camera's numbers as float32."""
+        camera = self.camera
+        numbers = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        return Intrinsics(*(jnp.float32(number) for number in numbers))
+
+
+def view_of(scan: Scan, sensor: Float[np.ndarray, "3"] | None = None) -> View:
+    """Return a scan as seen from its sensor, by default from the origin.
+
+    A depth image is its own view. Of a cloud an image is made whose pixels are about as fine as its points. Raises
+    InputError if the sensor's place lies among the points.
+    """
+    if scan.depth is not None and scan.camera is not None:
+        return View(np.eye(4), scan.points, scan.depth, scan.camera)
+    place = np.zeros(3) if sensor is None else np.asarray(sensor, dtype=np.float64)
+    offsets = scan.points.astype(np.float64) - place
+    distances = np.linalg.norm(offsets, axis=1)
+    typical = float(np.median(distances))
+    rotation = _towards(offsets.mean(axis=0), typical)
+    points = offsets @ rotation.T
+    if distances.min() <= _NEAREST * typical or (points[:, 2] <= 0).mean() > 0.01:
+        where = "the origin" if sensor is None else f"{tuple(float(x) for x in place)}"
+        raise InputError(f"the sensor cannot have been at {where}, among the points: say where it was")
+    points = points[points[:, 2] > 0].astype(np.float32)
+    camera = _fine_camera(points)
+    T_scene_view = np.eye(4)
+    T_scene_view[:3, :3], T_scene_view[:3, 3] = rotation.T, place
+    view = View(T_scene_view, points, np.zeros((camera.height, camera.width), np.float32), camera)
+    depth = _buffer(points, view.intrinsics, (camera.height, camera.width))
+    return View(T_scene_view, points, depth, camera)
+
+
+def _towards(direction: Float[np.ndarray, "3"], typical: float) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation that makes a direction the z axis, the identity if it nearly is."""
+    length = float(np.linalg.norm(direction))
+    if length < _NEAREST * typical:
+        return np.eye(3)  # all around: refused by what follows
+    z = direction / length
+    if z[2] > np.cos(np.radians(30)):
+        return np.eye(3)
+    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _fine_camera(points: Float32[np.ndarray, "n 3"]) -> Camera:
+    """Return a camera that sees all points, with pixels as wide as points are apart."""
+    from scipy.spatial import cKDTree
+
+    directions = points[:, :2] / points[:, 2:]
+    low, high = np.percentile(directions, 0.1, axis=0), np.percentile(directions, 99.9, axis=0)
+    chosen = np.random.default_rng(0).permutation(len(points))[:_SAMPLE]
+    if len(points) > 1:
+        apart = cKDTree(directions).query(directions[chosen], k=2)[0][:, 1]
+        spacing = float(np.percentile(apart, 75))
+    else:
+        spacing = 0.0
+    extent = np.maximum(high - low, 1e-3)  # also of a single point
+    spacing = max(spacing, float(extent.max()) / _LARGEST, 1e-9)
+    width, height = (int(np.clip(np.ceil(size / spacing) + 1, 2, _LARGEST + 1)) for size in extent)
+    focal = 1 / spacing
+    return Camera(focal, focal, float(-low[0] * focal), float(-low[1] * focal), width, height)
+
+
+def _buffer(
+    points: Float32[np.ndarray, "n 3"], camera: Intrinsics, shape: tuple[int, int]
+) -> Float32[np.ndarray, "h w"]:
+    count = len(points)
+    capacity = 1 << max(count - 1, 1).bit_length()  # few sizes are compiled
+    padded = np.zeros((capacity, 3), dtype=np.float32)
+    padded[:count] = points
+    mask: Bool[np.ndarray, " r"] = np.arange(capacity) < count
+    made = jax.jit(depth_buffer, static_argnums=3)(jnp.asarray(padded), jnp.asarray(mask), camera, shape)
+    return np.asarray(made)
