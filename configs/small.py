@@ -2,8 +2,9 @@
 
 small
     Command:   python -m experiments.train small
-    Hardware:  2 CPU cores: about 25 samples/s, of which making the samples takes a quarter. Not yet run.
-    Expected:  not yet known.
+    Hardware:  2 CPU cores: 61 samples/s, of which making the samples takes 15%; half as many beside other work.
+    Expected:  after 10,000 of the 20,000 steps, 1.5 h: validation loss 1.80, segmentation accuracy 0.977, keypoint
+               accuracy 0.218; see kmn_jax/pretrained/small.md.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ from kmn_jax.train.rendered import rendered_frames
 from kmn_jax.train.sharding import data_mesh, jit_eval_step, put_batch, put_whole
 from kmn_jax.train.step import Samples, StepConfig, Sums, index_of, mean_metrics
 
-SHIPPED = Path("kmn_jax/pretrained/small.safetensors")
+SHIPPED = Path(__file__).parent.parent / "kmn_jax" / "pretrained" / "small.safetensors"
 _TEST_SETS = (Path("outputs/test_sets/electronics"), Path("outputs/test_sets/industrial"))
 _CROPS_A_FRAME = 5  # of a test image
 

@@ -14,7 +14,8 @@ import pytest
 
 from configs import find_config
 from experiments import evaluate_network, release
-from kmn_jax.models import KeyMatchNetConfig, create_model, load_model, save_model
+from kmn_jax.checks import InputError
+from kmn_jax.models import KeyMatchNetConfig, create_model, load_model, load_pretrained, save_model
 
 ASSETS = Path(__file__).parent.parent.parent / "experiments" / "assets"
 NETWORK = KeyMatchNetConfig(
@@ -85,6 +86,25 @@ def test_every_split_and_object_is_counted(run: Path, evaluation: Path) -> None:
         assert 0 <= row["keypoints"] <= 0.6
     means = [sum(row["crops"] * row["loss"] for row in rows) / test["crops"]]
     assert means[0] == pytest.approx(test["loss"], rel=1e-4)
+
+
+def test_the_released_model_does_what_its_card_says(tmp_path: Path) -> None:
+    path = tmp_path / "network.json"
+    arguments = ["--pack", "nowhere", "--test-sets", str(ASSETS / "small_test_set"), "--json", str(path)]
+    assert evaluate_network.main([str(evaluate_network.SHIPPED), *arguments]) == 0
+    results = json.loads(path.read_text())
+    card = evaluate_network.SHIPPED.with_suffix(".md").read_text()
+    assert results["sha256"][:16] in card
+    assert load_pretrained("small").config.num_keypoints == 20
+    # Two objects of a few images: less exact than the card's seven, and better than chance by far.
+    (found,) = results["splits"]
+    assert found["segmentation"] > 0.93
+    assert found["keypoints"] > 2.5 / 20
+
+
+def test_a_model_that_was_never_released_is_refused() -> None:
+    with pytest.raises(InputError, match=r"there is no released model 'huge': there are small"):
+        load_pretrained("huge")
 
 
 def test_a_release_holds_weights_curve_picture_and_card(run: Path, evaluation: Path, tmp_path: Path) -> None:
