@@ -85,6 +85,8 @@ def find_candidates(
     if not foreground.any():
         raise InputError("no point of the scan is left as foreground: check background, region and units")
     rows = _thinned(view.points, foreground, seed, config.most_points)
+    if at is not None:  # what was pointed at stays
+        rows = np.union1d(rows, [_nearest_row(view.points, place) for place in at])
     points, front = view.points[rows], foreground[rows]
     scene, candidates = _padded(points, front)
     if at is None:
@@ -179,7 +181,11 @@ def _seed_count(points: Float32[np.ndarray, "n 3"], spacing: float, most: int) -
 
 
 def _nearest_rows(points: Float32[np.ndarray, "n 3"], at: Float[np.ndarray, "k 3"]) -> tuple[Array, Array]:
-    rows = [int(((points - place) ** 2).sum(axis=1).argmin()) for place in at]
+    rows = [_nearest_row(points, place) for place in at]
     count = next((size for size in _SEEDS if size >= len(rows)), len(rows))
     real = np.arange(count) < len(rows)
     return jnp.asarray(rows + rows[:1] * (count - len(rows)), dtype=jnp.int32), jnp.asarray(real)
+
+
+def _nearest_row(points: Float32[np.ndarray, "n 3"], place: Float[np.ndarray, "3"]) -> int:
+    return int(((points - place) ** 2).sum(axis=1).argmin())

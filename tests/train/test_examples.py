@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from kmn_jax.checks import InputError
-from kmn_jax.data.crops import CropConfig
-from kmn_jax.data.device_pack import StackedPack, stack_pack
+from kmn_jax.data.crops import CropConfig, draw_crop
+from kmn_jax.data.device_pack import StackedPack, stack_pack, take_scene, visible_points
 from kmn_jax.data.pack import Pack
 from kmn_jax.models import KeyMatchNetConfig
 from kmn_jax.train.examples import ExampleConfig, Group, RenderedCrops, make_group
@@ -66,13 +66,21 @@ def test_plain_examples_have_the_first_surfels_and_farthest_keypoints(stacked: S
     assert found.crops.shape == (4, 64, 6)
     assert bool(found.valid.all())
     np.testing.assert_allclose(np.linalg.norm(np.asarray(found.crops)[:, 0, :3], axis=1), 0, atol=1e-7)
-    for crop, is_object, label in zip(found.crops, found.is_object, found.keypoint, strict=True):
-        # Points of one keypoint lie close together, as measured by those of all: labels are of the right copy and pose.
-        xyz, label = np.asarray(crop)[np.asarray(is_object), :3], np.asarray(label)[np.asarray(is_object)]
-        apart = distances(xyz)
-        same = label[:, None] == label[None]
-        assert apart[same].max() < apart.max()
-        assert apart[same].mean() < 0.7 * apart[~same].mean()
+    # Labels are the nearest of these keypoints in the pose of the seed's copy, which the crop itself is drawn with.
+    keypoints = jnp.asarray(found.cloud)[found.keypoint_indices, :3]
+    scene = take_scene(stacked.arrays, jnp.int32(1), jnp.int32(2))
+    key = jax.random.fold_in(jax.random.wrap_key_data(keys(0, 4)[2]), 0)
+    made = jax.jit(draw_crop, static_argnames="config")(
+        key, visible_points(scene), keypoints, scene.T_camera_object, scene.diameter, config=CONFIG.plain().crops
+    )
+    np.testing.assert_allclose(found.crops[2, :, :3], made.points, atol=1e-7)
+    inside = np.asarray(made.points) - np.asarray(made.T_crop_object)[:3, 3]
+    points_object = inside @ np.asarray(made.T_crop_object)[:3, :3]
+    apart = np.linalg.norm(points_object[:, None] - np.asarray(keypoints)[None], axis=2)
+    on_object = np.asarray(found.is_object)[2]
+    assert on_object.sum() > 5
+    chosen = apart[np.arange(64), np.asarray(found.keypoint)[2]]
+    np.testing.assert_allclose(chosen[on_object], apart.min(axis=1)[on_object], atol=1e-6)
 
 
 def test_augmented_clouds_are_moved_by_a_rigid_motion_and_noise(stacked: StackedPack) -> None:
