@@ -13,22 +13,11 @@ from safetensors.numpy import load_file, save_file
 from kmn_jax.checks import InputError
 from kmn_jax.data.cad import ObjectConfig, ObjectModel, load_object
 from kmn_jax.estimator.part import Part, load_part, make_part, model_digest, save_part
-from kmn_jax.models import KeyMatchNetConfig, Model, create_model, load_model, save_model
+from kmn_jax.models import Model, create_model, load_model, save_model
+from tests.reference.networks import TINY
 
 STL = Path(__file__).parent.parent.parent / "experiments" / "assets" / "industrial" / "shaft.stl"
-CONFIG = KeyMatchNetConfig(
-    num_object_points=128,
-    num_keypoints=8,
-    num_neighbors=4,
-    edge_width=8,
-    embedding_width=16,
-    scene_width=16,
-    object_width=8,
-    pair_width=8,
-    groups=4,
-    graph="static",
-    inputs="invariant",
-)
+CONFIG = replace(TINY, num_object_points=128, num_keypoints=8)
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,24 +18,12 @@ from kmn_jax.estimator.search import (
     search,
     spread_seeds,
 )
-from kmn_jax.models import KeyMatchNetConfig, Model, create_model, encode_object
+from kmn_jax.models import Model, create_model, encode_object
 from kmn_jax.pose import RansacConfig
 from tests.reference.clouds import box_cloud
+from tests.reference.networks import TINY
 
-NETWORK = KeyMatchNetConfig(
-    num_scene_points=64,
-    num_object_points=64,
-    num_keypoints=6,
-    num_neighbors=4,
-    edge_width=8,
-    embedding_width=16,
-    scene_width=16,
-    object_width=8,
-    pair_width=8,
-    groups=4,
-    graph="static",
-    inputs="invariant",
-)
+NETWORK = replace(TINY, num_keypoints=6)
 CONFIG = SearchConfig(ransac=RansacConfig(num_hypotheses=50, num_candidates=200), normal_points=256)
 
 

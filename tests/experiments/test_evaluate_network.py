@@ -15,33 +15,20 @@ import pytest
 from configs import find_config
 from experiments import evaluate_network, release
 from kmn_jax.checks import InputError
-from kmn_jax.models import KeyMatchNetConfig, create_model, load_model, load_pretrained, save_model
+from kmn_jax.models import create_model, load_model, load_pretrained, save_model
+from tests.reference.networks import TINY
 
 ASSETS = Path(__file__).parent.parent.parent / "experiments" / "assets"
-NETWORK = KeyMatchNetConfig(
-    num_scene_points=64,
-    num_object_points=64,
-    num_keypoints=4,
-    num_neighbors=4,
-    edge_width=8,
-    embedding_width=16,
-    scene_width=16,
-    object_width=8,
-    pair_width=8,
-    groups=4,
-    inputs="invariant",
-    graph="static",
-)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder as a run leaves it, of a network that was never trained."""
     folder = tmp_path_factory.mktemp("run")
-    save_model(create_model(NETWORK, jax.random.key(0)), folder / "model.safetensors")
+    save_model(create_model(TINY, jax.random.key(0)), folder / "model.safetensors")
     debug = find_config("debug")
     crops = replace(debug.examples.crops, num_points=64)
-    config = replace(debug, name="tiny", network=NETWORK, examples=replace(debug.examples, crops=crops))
+    config = replace(debug, name="tiny", network=TINY, examples=replace(debug.examples, crops=crops))
     (folder / "config.json").write_text(json.dumps(asdict(config)))
     session = {
         "training_objects": 4,
@@ -110,7 +97,7 @@ def test_a_model_that_was_never_released_is_refused() -> None:
 def test_a_release_holds_weights_curve_picture_and_card(run: Path, evaluation: Path, tmp_path: Path) -> None:
     assert release.main([str(run), str(evaluation), "--folder", str(tmp_path)]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["tiny.csv", "tiny.md", "tiny.png", "tiny.safetensors"]
-    assert load_model(tmp_path / "tiny.safetensors").config == NETWORK
+    assert load_model(tmp_path / "tiny.safetensors").config == TINY
     assert (tmp_path / "tiny.csv").read_text().splitlines()[1] == "10,80,600,train,2.9,0.6,0.01"
     card = (tmp_path / "tiny.md").read_text()
     for fact in (

@@ -15,19 +15,7 @@ from kmn_jax.models import KeyMatchNetConfig, create_model
 from kmn_jax.train.optimizer import OptimizerConfig
 from kmn_jax.train.snapshot import Snapshot
 from kmn_jax.train.step import TrainState
-
-TINY = KeyMatchNetConfig(
-    num_scene_points=32,
-    num_object_points=32,
-    num_keypoints=4,
-    num_neighbors=4,
-    edge_width=8,
-    embedding_width=16,
-    scene_width=16,
-    object_width=8,
-    pair_width=8,
-    groups=4,
-)
+from tests.reference.networks import TINY
 
 
 @cache
