@@ -14,21 +14,26 @@ from pathlib import Path
 from typing import Any
 
 _ROOT = Path(__file__).parent.parent
+_GIVE_BACK = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"}
 
 
 def peak_of_each(forms: Sequence[str]) -> dict[str, int]:
     """Return the peak in bytes by form, leaving out forms that cannot run here."""
     peaks = {}
     for form in forms:
-        environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"}
-        command = [sys.executable, "-m", "benchmarks.memory", form]
-        result = subprocess.run(command, cwd=_ROOT, env=environment, capture_output=True, text=True)
+        result = run_apart(["-m", "benchmarks.memory", form])
         if result.returncode != 0:
             last = result.stderr.strip().splitlines()[-1:] or ["no message"]
             print(f"{form}: memory not measured: {last[0]}")
             continue
         peaks[form] = int(result.stdout.split()[-1])
     return peaks
+
+
+def run_apart(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    """Run Python in a process whose allocator keeps no large block that was freed."""
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, cwd=_ROOT, env=os.environ | _GIVE_BACK, capture_output=True, text=True)
 
 
 def _peak_above_use(run: Callable[[], Any]) -> int:

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
@@ -31,11 +30,10 @@ from kmn_jax.report import check_target, print_table, write_json
 from kmn_jax.train.examples import ExampleConfig
 from kmn_jax.train.rendered import rendered_frames
 from kmn_jax.train.sharding import data_mesh, jit_eval_step, put_batch, put_whole
-from kmn_jax.train.step import Samples, StepConfig, Sums, index_of, mean_metrics
+from kmn_jax.train.step import Samples, StepConfig, Sums, index_of, mean_metrics, total_sums
 
 SHIPPED = Path(__file__).parent.parent / "kmn_jax" / "pretrained" / "small.safetensors"
 _TEST_SETS = (Path("outputs/test_sets/electronics"), Path("outputs/test_sets/industrial"))
-_CROPS_A_FRAME = 5  # of a test image
 
 # arXiv 2303.16102, Table I: the test split of the electronic components, trained on all objects or on a tenth of them.
 PUBLISHED = (
@@ -55,7 +53,7 @@ class Options:
     training_objects: int = 200  # spread evenly over the pack's
     crops: int = 20  # of each training and validation object
     test_sets: tuple[Path, ...] = _TEST_SETS  # BOP datasets with a split `test`
-    crops_a_frame: int = _CROPS_A_FRAME
+    crops_a_frame: int = 5  # of each test image
     json: Path | None = None  # file to write the numbers to
 
 
@@ -79,12 +77,7 @@ class Evaluator:
             step = jit_eval_step(self._graphdef, config, self._mesh)
             sums = step(self._parameters, pack, put_batch(samples, self._mesh))
             found[names[int(index.object[0])]].append(jax.device_get(sums))
-        return {name: total(parts) for name, parts in found.items() if parts}
-
-
-def total(parts: Sequence[Sums]) -> Sums:
-    """Return the sum of sums."""
-    return Sums(*(jnp.float32(np.sum(column, dtype=np.float64)) for column in zip(*parts, strict=True)))
+        return {name: total_sums(parts) for name, parts in found.items() if parts}
 
 
 def pack_rows(evaluator: Evaluator, folder: Path, split: str, most: int | None, crops: int) -> dict[str, Sums]:
@@ -147,11 +140,11 @@ def evaluate(options: Options) -> dict[str, Any]:
                 continue
             found = pack_rows(evaluator, options.pack, split, most, options.crops)
             splits.append(
-                row(f"{split}, {options.pack.name}, training renderer", total(list(found.values())), len(found))
+                row(f"{split}, {options.pack.name}, training renderer", total_sums(list(found.values())), len(found))
             )
     for folder in options.test_sets:
         found = test_rows(evaluator, folder, options.crops_a_frame)
-        splits.append(row(f"test, {folder.name}, ray casting", total(list(found.values())), len(found)))
+        splits.append(row(f"test, {folder.name}, ray casting", total_sums(list(found.values())), len(found)))
         details[folder.name] = [row(name, sums) for name, sums in found.items()]
     print_table("Loss and accuracies (Table I)", [*splits, *PUBLISHED])
     for name, rows in details.items():

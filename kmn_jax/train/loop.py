@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array
@@ -45,7 +44,7 @@ from kmn_jax.train.sharding import (
 )
 from kmn_jax.train.snapshot import Snapshot, from_first_process
 from kmn_jax.train.sources import training_source, validation_source
-from kmn_jax.train.step import Metrics, Samples, create_state, index_of, mean_metrics
+from kmn_jax.train.step import Metrics, Samples, create_state, index_of, mean_metrics, total_sums
 from kmn_jax.train.stop import StopRequest
 from kmn_jax.train.transfer import FILE_LIMIT, MANIFEST, export_snapshot, import_snapshot
 from kmn_jax.train.window import MEANS, Window
@@ -147,10 +146,10 @@ class _Run:
         self.report = report if self.first else _ignore
         size = config.pipeline.batch_size
         check_batch(size, config.step, mesh)
-        self.training = training_source(config, mesh, lambda problem: self.report(f"left out: {problem}"))
-        self.validation = validation_source(config, mesh)
-        for problem in (*self.training.problems, *self.validation.problems):
-            self.report(f"left out: {problem}")
+        self.training, self.validation = (
+            source(config, mesh, lambda problem: self.report(f"left out: {problem}"))
+            for source in (training_source, validation_source)
+        )
         optimizer, num_steps = config.optimizer, config.num_steps
         self.graphdef, state = create_state(config.step, optimizer.build(num_steps))
         self.state = put_whole(state, mesh)
@@ -300,8 +299,7 @@ class _Run:
                 batch = put_batch(batches[number], self.mesh)
                 found.append(self.eval_step(self.state.average, self.validation.pack, batch))
             jax.block_until_ready(found[max(0, number - _AHEAD)])
-        total = jax.tree.map(lambda *parts: jnp.float32(np.sum(parts, dtype=np.float64)), *jax.device_get(found))
-        metrics = mean_metrics(total)
+        metrics = mean_metrics(total_sums(jax.device_get(found)))
         means = {name: float(getattr(metrics, name)) for name in MEANS}
         self._write(self.step, "validation", means)
         self.validated = self.step
@@ -331,7 +329,7 @@ class _Run:
 
     def _snapshot(self) -> Snapshot:
         facts = {
-            "config": json.loads(json.dumps(asdict(self.config))),
+            "config": asdict(self.config),
             "step": self.step,
             "samples": self.step * self.config.pipeline.batch_size,
             "seconds": self._seconds(),

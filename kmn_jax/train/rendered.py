@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from kmn_jax.checks import InputError
@@ -57,7 +56,7 @@ class RenderedFrames:
         crops = RenderedCrops(
             crop.points, crop.normals, crop.mask, crop.is_object, crop.T_crop_object.astype(np.float32), crop.valid
         )
-        return RenderedSamples(samples, jax.tree.map(np.asarray, crops))
+        return RenderedSamples(samples, crops)
 
 
 def rendered_frames(

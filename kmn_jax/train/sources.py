@@ -18,6 +18,8 @@ from kmn_jax.train.rendered import rendered_frames
 from kmn_jax.train.sharding import put_whole
 from kmn_jax.train.step import Samples
 
+Report = Callable[[str], None]  # is given one sentence for each object or image that is left out
+
 _VALIDATION_SEED = 0  # of the samples, so that runs of all seeds are validated on the same
 
 
@@ -29,14 +31,17 @@ class Source:
     names: tuple[str, ...]
     digest: str
     batches: SampleBatches
-    problems: tuple[str, ...]
     read: Callable[[SampleIndex], Samples] | None = None  # makes a batch on the host, if the steps do not
 
 
-def training_source(config: TrainConfig, mesh: Mesh, report: Callable[[str], None] | None = None) -> Source:
+def _ignore(problem: str) -> None:
+    pass
+
+
+def training_source(config: TrainConfig, mesh: Mesh, report: Report = _ignore) -> Source:
     """Return the training objects, or the configured share of them, and their endless samples.
 
-    Problems of images that are found while they are read go to `report`.
+    What is left out goes to `report`, of images also while they are read.
     """
     if config.rendered is not None:
         return _rendered_source(config, config.rendered, mesh, report)
@@ -45,16 +50,14 @@ def training_source(config: TrainConfig, mesh: Mesh, report: Callable[[str], Non
     count = max(1, round(config.training_share * len(names)))
     chosen = [names[row * len(names) // count] for row in range(min(count, len(names)))]
     stacked = stack_pack(pack, chosen if names else "train", _with_bits(config))
-    _check_surfels(config, stacked)
-    return _source(stacked, config.pipeline, mesh, ordered=False)
+    return _source(config, stacked, config.pipeline, mesh, report, ordered=False)
 
 
-def validation_source(config: TrainConfig, mesh: Mesh) -> Source:
-    """Return the validation objects and their fixed samples, in order, as one pass."""
+def validation_source(config: TrainConfig, mesh: Mesh, report: Report = _ignore) -> Source:
+    """Return the validation objects and their fixed samples, in order, as one pass; see `training_source`."""
     stacked = stack_pack(Pack(config.pack), "validation", _with_bits(config))
-    _check_surfels(config, stacked)
     pipeline = replace(config.pipeline, samples_per_object=config.validation_samples, seed=_VALIDATION_SEED)
-    return _source(stacked, pipeline, mesh, ordered=True)
+    return _source(config, stacked, pipeline, mesh, report, ordered=True)
 
 
 def _check_surfels(config: TrainConfig, stacked: StackedPack) -> None:
@@ -71,7 +74,17 @@ def _with_bits(config: TrainConfig) -> bool:
     return config.examples.visibility == "bits"
 
 
-def _source(stacked: StackedPack, pipeline: PipelineConfig, mesh: Mesh, ordered: bool) -> Source:
+def _source(
+    config: TrainConfig,
+    stacked: StackedPack,
+    pipeline: PipelineConfig,
+    mesh: Mesh,
+    report: Report,
+    ordered: bool,
+) -> Source:
+    _check_surfels(config, stacked)
+    for problem in stacked.problems:
+        report(problem)
     batches = SampleBatches(
         pipeline,
         len(stacked.names),
@@ -80,12 +93,12 @@ def _source(stacked: StackedPack, pipeline: PipelineConfig, mesh: Mesh, ordered:
         shard_count=jax.process_count(),
         ordered=ordered,
     )
-    return Source(put_whole(stacked.arrays, mesh), stacked.names, stacked.digest, batches, stacked.problems)
+    return Source(put_whole(stacked.arrays, mesh), stacked.names, stacked.digest, batches)
 
 
-def _rendered_source(config: TrainConfig, folder: str, mesh: Mesh, report: Callable[[str], None] | None) -> Source:
+def _rendered_source(config: TrainConfig, folder: str, mesh: Mesh, report: Report) -> Source:
     frames = rendered_frames(folder, config.rendered_split, config.network, config.examples.crops, report)
     batches = SampleBatches(
         config.pipeline, frames.num_frames, 1, shard_index=jax.process_index(), shard_count=jax.process_count()
     )
-    return Source(put_whole(frames.pack, mesh), frames.names, frames.digest, batches, (), frames.read)
+    return Source(put_whole(frames.pack, mesh), frames.names, frames.digest, batches, frames.read)

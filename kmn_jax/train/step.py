@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
@@ -327,6 +328,11 @@ def _summed(function: Callable[[_Item], _Result], items: _Item) -> _Result:
 
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, first))
     return jax.lax.scan(add, zeros, items)[0]
+
+
+def total_sums(parts: Sequence[Sums]) -> Sums:
+    """Return the sum of the sums of several batches, added up on the host in float64."""
+    return jax.tree.map(lambda *values: jnp.float32(np.sum(values, dtype=np.float64)), *parts)
 
 
 def mean_metrics(sums: Sums) -> Metrics:
