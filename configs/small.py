@@ -19,7 +19,7 @@ from kmn_jax.train.optimizer import OptimizerConfig
 small = TrainConfig(
     name="small",
     pack="outputs/packs/electronics",
-    num_steps=20_000,
+    num_steps=30_000,
     network=KeyMatchNetConfig(
         num_scene_points=512,
         num_object_points=512,
@@ -34,7 +34,9 @@ small = TrainConfig(
         inputs="invariant",
         graph="static",
     ),
-    examples=ExampleConfig(crops=CropConfig(num_points=512), crops_per_scene=2, random_keypoints=0.3),
+    examples=ExampleConfig(
+        crops=CropConfig(num_points=512, instance_seeds=0.5), crops_per_scene=4, random_keypoints=0.3
+    ),
     optimizer=OptimizerConfig(
         method="muon",
         schedule="cosine",

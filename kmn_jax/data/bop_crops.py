@@ -15,12 +15,12 @@ from jaxtyping import Bool, Float, Int, Int32
 from kmn_jax.checks import InputError
 from kmn_jax.data.bop import BopDataset, BopFrame, BopInstance, FrameKey
 from kmn_jax.data.cad import ObjectConfig, ObjectModel, load_object
-from kmn_jax.data.crops import Crop, CropConfig, draw_crop
+from kmn_jax.data.crops import Crop, CropConfig, crop_around
 from kmn_jax.data.pipeline import SampleIndex
 from kmn_jax.data.scene import Camera
 from kmn_jax.data.splat import BIN, VisiblePoints
 
-_draw_crop = jax.jit(draw_crop, static_argnames="config")
+_crop_around = jax.jit(crop_around, static_argnames="config")
 
 
 @dataclass(frozen=True)
@@ -172,13 +172,10 @@ class BopCrops:
     ) -> Crop:
         """Return the crop of points around the first, which lies on copy 0."""
         count, capacity = len(points), self.config.crop.num_drawn
-        # Pixels cover the same area of the picture. The seed is drawn already: next to it the others weigh nothing.
-        area = np.full(capacity, 1e-30, dtype=np.float32)
-        area[:1] = 1
         arrays: dict[str, Any] = {
             "points": np.zeros((capacity, 3), dtype=np.float32),
             "normals": np.zeros((capacity, 3), dtype=np.float32),
-            "picture_area": area,
+            "picture_area": np.ones(capacity, dtype=np.float32),  # pixels cover the same area of the picture
             "instance": np.full(capacity, BIN, dtype=np.int32),
             "mask": np.arange(capacity) < count,
             "visible_fraction": np.array([1, 0], dtype=np.float32),
@@ -187,7 +184,16 @@ class BopCrops:
         poses = np.stack([T_camera_object, np.eye(4)]).astype(np.float32)
         keypoints, diameter = model.points[: self.config.num_keypoints], np.float32(model.diameter)
         with _on_host():
-            crop = _draw_crop(key, VisiblePoints(**arrays), keypoints, poses, diameter, config=self.config.crop)
+            crop = _crop_around(
+                key,
+                VisiblePoints(**arrays),
+                np.int32(0),
+                np.bool_(count > 0),
+                keypoints,
+                poses,
+                diameter,
+                config=self.config.crop,
+            )
             result: Crop = jax.tree.map(np.asarray, crop)
         return result
 

@@ -38,6 +38,7 @@ class CropConfig:
     include_bin: bool = True
     min_points: int = 16  # a crop of fewer is not valid
     min_visible_fraction: float = 0.1  # of the seed's copy, see VisiblePoints
+    instance_seeds: float = 0.0  # share of seeds that lie on a random copy, whatever picture area it covers
 
     def __post_init__(self) -> None:
         if not 1 <= self.min_points <= self.num_points:
@@ -53,6 +54,8 @@ class CropConfig:
                 f"normal_radius = {self.normal_radius} must be above zero"
                 f" and normal_points = {self.normal_points} at least 3"
             )
+        if not 0 <= self.instance_seeds <= 1:
+            raise ValueError(f"instance_seeds = {self.instance_seeds} is a share: it must be between 0 and 1")
 
     @property
     def num_drawn(self) -> int:
@@ -87,19 +90,35 @@ def draw_crop(
     diameter: Scalar,
     config: CropConfig = CropConfig(),
 ) -> Crop:
-    """Draw a seed among the visible object points, and the points of its crop without replacement.
+    """Draw a seed among the visible object points, in proportion to the picture area covered, and the crop around it.
 
-    Both are drawn as pixels of an image would be: in proportion to the picture area that each point covers. Noise is
-    added before normals are estimated; labels are those of the points without it. Where a normal cannot be
-    estimated (fewer than three points, or all on a line), it is the direction to the camera.
+    In the configured share of the draws, the seed's copy is drawn first, all being equally likely.
     """
-    total = visible.mask.shape[0]
-    if total < 1:
-        raise ValueError("visible holds no points: a scene needs at least one copy and one surfel")
-    seed_key, draw_key, sigma_key, noise_key = jax.random.split(key, 4)
-    weights = jnp.where(visible.mask, visible.picture_area, 0)
-    seed_row, found = _draw_seed(seed_key, visible, weights, config.min_visible_fraction)
+    _check_points(visible)
+    seed_key, crop_key = jax.random.split(key)
+    row, found = _draw_seed(seed_key, visible, config)
+    return crop_around(crop_key, visible, row, found, keypoints_object, T_camera_object, diameter, config)
 
+
+def crop_around(
+    key: PRNGKey,
+    visible: VisiblePoints,
+    seed_row: Int[Array, ""],
+    found: Bool[Array, ""],
+    keypoints_object: Float[Array, "k 3"],
+    T_camera_object: Float[Array, "c 4 4"],
+    diameter: Scalar,
+    config: CropConfig = CropConfig(),
+) -> Crop:
+    """Draw the points of a crop around the seed in a row, without replacement; `found` tells whether it is one.
+
+    They are drawn as pixels of an image would be: in proportion to the picture area that each covers. Noise is added
+    before normals are estimated; labels are those of the points without it. Where a normal cannot be estimated (fewer
+    than three points, or all on a line), it is the direction to the camera.
+    """
+    _check_points(visible)
+    draw_key, sigma_key, noise_key = jax.random.split(key, 3)
+    weights = jnp.where(visible.mask, visible.picture_area, 0)
     x, y, z = (visible.points[:, axis] - visible.points[seed_row, axis] for axis in range(3))
     inside = found & (weights > 0) & (x**2 + y**2 + z**2 <= (config.radius * diameter) ** 2)
     if not config.include_bin:
@@ -144,16 +163,26 @@ def draw_crop(
     )
 
 
-def _draw_seed(
-    key: PRNGKey, visible: VisiblePoints, weights: Float[Array, " r"], min_visible_fraction: float
-) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+def _check_points(visible: VisiblePoints) -> None:
+    if visible.mask.shape[0] < 1:
+        raise ValueError("visible holds no points: a scene needs at least one copy and one surfel")
+
+
+def _draw_seed(key: PRNGKey, visible: VisiblePoints, config: CropConfig) -> tuple[Int[Array, ""], Bool[Array, ""]]:
     """Return the row of a random point on a copy of which enough is visible, and whether there is one."""
+    place_key, share_key, copy_key = jax.random.split(key, 3)
     on_copy = visible.instance != BIN
-    enough = (visible.visible_fraction >= min_visible_fraction)[jnp.where(on_copy, visible.instance, 0)]
-    weights = jnp.where(on_copy & enough, weights, 0)
+    enough = visible.visible_fraction >= config.min_visible_fraction
+    some = visible.mask & (visible.picture_area > 0) & on_copy & enough[jnp.where(on_copy, visible.instance, 0)]
+    weights = jnp.where(some, visible.picture_area, 0)
+    if config.instance_seeds > 0:
+        drawable = enough & (visible.visible_fraction > 0)
+        copy = jax.random.categorical(copy_key, jnp.where(drawable, 0.0, -jnp.inf))
+        whole = jax.random.uniform(share_key) >= config.instance_seeds
+        weights = jnp.where(whole | (visible.instance == copy), weights, 0)
     # In whole numbers, whose running sums never fall and are exact.
     ends = jnp.cumsum((weights * (2.0**30 / jnp.maximum(weights.sum(), _TINY))).astype(jnp.int32))
-    place = jax.random.randint(key, (), 0, jnp.maximum(ends[-1], 1))
+    place = jax.random.randint(place_key, (), 0, jnp.maximum(ends[-1], 1))
     row = jnp.searchsorted(ends, place, side="right")
     return jnp.minimum(row, ends.shape[0] - 1), ends[-1] > 0
 

@@ -11,13 +11,11 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from kmn_jax.data.crops import CropConfig, draw_crop
+from kmn_jax.data.crops import CropConfig, crop_around
 from kmn_jax.data.splat import BIN, VisiblePoints
 from kmn_jax.geometry import farthest_point_indices
 from kmn_jax.pose import IcpConfig, MatchConfig, RansacConfig, find_matches, icp, ransac
 from kmn_jax.typing import Points, Pose, PRNGKey, Scalar
-
-_UNLIKELY = 1e-30  # next to the seed's weight of 1
 
 
 @dataclass(frozen=True)
@@ -119,7 +117,16 @@ def _hypothesis(
 ) -> Hypotheses:
     network = nnx.merge(graphdef, parameters)
     crop_key, pose_key = jax.random.split(key)
-    crop = draw_crop(crop_key, _around(scene, seed), jnp.zeros((1, 3)), jnp.eye(4)[None], part.diameter, crops)
+    crop = crop_around(
+        crop_key,
+        _as_visible(scene),
+        seed,
+        scene.mask[seed],
+        jnp.zeros((1, 3)),
+        jnp.eye(4)[None],
+        part.diameter,
+        crops,
+    )
     cloud = jnp.concatenate([crop.points, crop.normals], axis=1)
     features = network.encode_scene(cloud, part.diameter, crop.mask)
     segmentation, logits = network.match(features, part.features, crop.mask)
@@ -158,14 +165,13 @@ def _hypothesis(
     )
 
 
-def _around(scene: SceneArrays, seed: Int[Array, ""]) -> VisiblePoints:
-    """Return the scene as visible points of which only one may be the seed."""
-    is_seed = jnp.arange(scene.mask.shape[0], dtype=jnp.int32) == seed
+def _as_visible(scene: SceneArrays) -> VisiblePoints:
+    """Return a scan as visible points that all count alike."""
     return VisiblePoints(
         points=scene.points,
         normals=jnp.zeros_like(scene.points),
-        picture_area=jnp.where(is_seed, 1.0, _UNLIKELY),
-        instance=jnp.where(is_seed, 0, BIN).astype(jnp.int32),
+        picture_area=jnp.ones_like(scene.points[:, 0]),
+        instance=jnp.full(scene.mask.shape, BIN, dtype=jnp.int32),
         mask=scene.mask,
         visible_fraction=jnp.ones(1),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -223,6 +224,24 @@ def test_seeds_lie_only_on_copies_of_which_enough_is_visible() -> None:
     assert instances == {1, 3}
 
 
+def test_the_share_of_seeds_by_instance_is_drawn_from_each_copy_alike() -> None:
+    visible = scene(2)
+    # The first copy covers a hundred times as much of the picture; the last one is too hidden to be drawn from.
+    area = jnp.where(visible.instance == 0, 100 * visible.picture_area, visible.picture_area)
+    visible = visible._replace(picture_area=area, visible_fraction=jnp.ones(COPIES).at[-1].set(0.05))
+    keys = jax.random.split(jax.random.key(0), 400)
+
+    def shares(instance_seeds: float) -> np.ndarray:
+        config = replace(EXACT, instance_seeds=instance_seeds)
+        one = jax.jit(lambda key: draw(key, visible, KEYPOINTS, POSES, jnp.float32(DIAMETER), config).instance)
+        return np.bincount(np.asarray(jax.lax.map(one, keys)), minlength=COPIES) / len(keys)
+
+    assert shares(0.0)[0] > 0.95
+    alike = np.where(np.arange(COPIES) < COPIES - 1, 1 / (COPIES - 1), 0)
+    np.testing.assert_allclose(shares(1.0), alike, atol=0.08)
+    np.testing.assert_allclose(shares(0.5)[1:], alike[1:] / 2, atol=0.06)
+
+
 def test_noise_is_gaussian_of_the_said_deviation_clipped_at_three_sigma() -> None:
     visible = scene(0)
     sigmas, offsets = [], []
@@ -300,6 +319,7 @@ def test_vmap_equals_single_crops(config: CropConfig) -> None:
         {"max_noise": -0.1},
         {"normal_radius": 0.0},
         {"normal_points": 2},
+        {"instance_seeds": 1.5},
     ],
 )
 def test_a_config_that_makes_no_sense_is_refused(wrong: dict[str, Any]) -> None:
