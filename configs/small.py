@@ -19,7 +19,7 @@ from kmn_jax.train.optimizer import OptimizerConfig
 small = TrainConfig(
     name="small",
     pack="outputs/packs/electronics",
-    num_steps=30_000,
+    num_steps=22_000,
     network=KeyMatchNetConfig(
         num_scene_points=512,
         num_object_points=512,

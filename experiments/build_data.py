@@ -6,6 +6,8 @@ electronics  the training pack: 1,507 components of KiCad's public library, as `
              not installed.
 test-sets    7 electronic and 7 industrial objects in 20 bins each, rendered by ray casting, as BOP datasets; their
              digests are compared with those in `assets/test_sets.json`.
+validation-bins  the 50 validation components in 6 bins each, rendered by ray casting, one half as a perfect sensor sees
+             them, the other as a structured-light scanner: what the probabilities of detections are fitted on.
 check        what a pack holds: every file against its checksum, every copy against the walls of its bin.
 small        the few objects and images that the repository carries: `assets/small_pack`, `assets/small_test_set`.
 
@@ -27,11 +29,13 @@ from experiments.kicad import catalogue_sources
 from experiments.test_sets import (
     ASSETS,
     CONFIG,
+    VALIDATION_CONFIG,
     build_test_set,
     electronics_sources,
     industrial_sources,
     is_unexplained,
     record_digests,
+    validation_sources,
     verdict,
 )
 from kmn_jax.checks import InputError
@@ -105,6 +109,21 @@ class TestSets:
             print(f"{self.folder / name}: {digest}" + (f": {verdict(name, digest)}" if exact else ""))
         if exact and any(is_unexplained(name, digest) for name, digest in digests.items()):
             sys.exit(1)
+
+
+@dataclass(frozen=True)
+class ValidationBins:
+    """Build the bins that the probabilities of detections are fitted on."""
+
+    folder: Path = OUTPUTS / "validation_bins"
+    models: Path | None = None  # as for electronics
+    workers: int | None = None
+
+    def run(self) -> None:
+        sources = validation_sources(self.models, OUTPUTS / "kicad")
+        sensors = {"perfect": PERFECT, "structured_light": SensorConfig.structured_light()}
+        for row, (name, sensor) in enumerate(sensors.items()):
+            build_test_set(self.folder / name, sources[row::2], VALIDATION_CONFIG, sensor, self.workers)
 
 
 @dataclass(frozen=True)
@@ -201,7 +220,13 @@ def main() -> None:
     """Run one of the builds."""
     try:
         tyro.extras.subcommand_cli_from_dict(
-            {"electronics": Electronics, "test-sets": TestSets, "check": Check, "small": Small}
+            {
+                "electronics": Electronics,
+                "test-sets": TestSets,
+                "validation-bins": ValidationBins,
+                "check": Check,
+                "small": Small,
+            }
         ).run()
     except InputError as error:
         sys.exit(f"error: {error}")

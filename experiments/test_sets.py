@@ -31,6 +31,7 @@ ASSETS = Path(__file__).parent / "assets"
 DIGESTS = ASSETS / "test_sets.json"
 SPLIT = "test"
 CONFIG = PackConfig(seed=1)  # another seed than the training pack's
+VALIDATION_CONFIG = PackConfig(seed=2, drops=6)
 _LIBRARIES = ("cascadio", "jax", "mujoco", "numpy", "open3d", "scipy", "trimesh")
 
 
@@ -42,6 +43,11 @@ def industrial_sources() -> list[Source]:
 def electronics_sources(models: Path | None, cache: Path) -> list[Source]:
     """Return the held-out electronic components; see `catalogue_sources`."""
     return [source for source in catalogue_sources(models, cache, None)[0] if source.split == "test"]
+
+
+def validation_sources(models: Path | None, cache: Path) -> list[Source]:
+    """Return the validation components of the training pack: what probabilities are fitted on."""
+    return [source for source in catalogue_sources(models, cache, None)[0] if source.split == "validation"]
 
 
 def build_test_set(

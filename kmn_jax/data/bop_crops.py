@@ -17,7 +17,7 @@ from kmn_jax.data.bop import BopDataset, BopFrame, BopInstance, FrameKey
 from kmn_jax.data.cad import ObjectConfig, ObjectModel, load_object
 from kmn_jax.data.crops import Crop, CropConfig, crop_around
 from kmn_jax.data.pipeline import SampleIndex
-from kmn_jax.data.scene import Camera
+from kmn_jax.data.scene import measured_points
 from kmn_jax.data.splat import BIN, VisiblePoints
 
 _crop_around = jax.jit(crop_around, static_argnames="config")
@@ -251,7 +251,7 @@ class _View:
         self._surfaces, self._config = surfaces, config
         self.instances: Sequence[BopInstance] = frame.with_visibility().instances or ()
         self._pixels = np.flatnonzero(frame.depth > 0)
-        self.points = _measured_points(frame.depth, frame.camera)
+        self.points = measured_points(frame.depth, frame.camera)
         self._masks = None
         if frame.visible_masks is not None:
             self._masks = frame.visible_masks.reshape(len(frame.visible_masks), -1)
@@ -308,14 +308,6 @@ class _View:
 
 def _squared_lengths(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     return np.einsum("ij,ij->i", vectors, vectors)  # ten times faster than a sum over the short axis
-
-
-def _measured_points(depth: Float[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray, "n 3"]:
-    """Return the points of the pixels that have a depth, row by row; NumPy, as threads read frames beside a device."""
-    rows, columns = np.nonzero(depth > 0)
-    z = depth[rows, columns].astype(np.float64)
-    points = np.stack([(columns - camera.cx) / camera.fx * z, (rows - camera.cy) / camera.fy * z, z], axis=1)
-    return points.astype(np.float32)
 
 
 def _on_host() -> AbstractContextManager[Any]:

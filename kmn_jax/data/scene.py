@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from kmn_jax.checks import InputError
 
@@ -65,3 +65,14 @@ class BinScene:
     def T_camera_object(self) -> Float[np.ndarray, "n 4 4"]:
         """The poses of the copies in the camera frame."""
         return self.T_camera_bin @ self.T_bin_object
+
+
+def measured_points(depth: Float[np.ndarray, "h w"], camera: Camera) -> Float32[np.ndarray, "n 3"]:
+    """Return the points of the pixels that have a depth, row by row, in the camera frame and the depth's unit.
+
+    It stays on the host, as threads read frames beside a device.
+    """
+    rows, columns = np.nonzero(depth > 0)
+    z = depth[rows, columns].astype(np.float64)
+    points = np.stack([(columns - camera.cx) / camera.fx * z, (rows - camera.cy) / camera.fy * z, z], axis=1)
+    return points.astype(np.float32)

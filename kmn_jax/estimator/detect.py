@@ -1,191 +1,221 @@
-"""Candidates of a whole bin: seeds over the foreground, poses around them, and what speaks for and against each."""
+"""The copies of a part in a scene: rounds of candidates, the choice among them, and the order to pick them in."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32
 
 from kmn_jax.checks import InputError
-from kmn_jax.data.splat import Surfels
+from kmn_jax.data.symmetry import Symmetries
+from kmn_jax.estimator.calibrate import Calibration
+from kmn_jax.estimator.candidates import (
+    CandidateConfig,
+    Candidates,
+    Solver,
+    crop_prediction,
+    find_candidates,
+    improved,
+    join,
+    seeds_at,
+    seeds_over,
+)
+from kmn_jax.estimator.evidence import EVIDENCE
 from kmn_jax.estimator.part import Part
-from kmn_jax.estimator.search import Hypotheses, SceneArrays, SearchConfig, part_arrays, search, spread_seeds
-from kmn_jax.estimator.select import SelectConfig
-from kmn_jax.estimator.verify import Agreement, VerifyConfig, agreements
-from kmn_jax.estimator.view import View
+from kmn_jax.estimator.result import Detection, Detections
+from kmn_jax.estimator.scene import Scene
+from kmn_jax.estimator.select import SelectConfig, Selection, select
+from kmn_jax.estimator.timing import Clock
 from kmn_jax.models import Model
 
-_SEEDS = (8, 16, 32, 64, 128)  # numbers of seeds that are compiled
-_LEAST_POINTS = 4096  # the smallest capacity that is compiled
-_VERIFIED_POINTS = 2048  # on an object's surface
+_SHARES = ("explained", "violated", "occluded", "unknown")
+_LEAST_CROWD = 16  # points
 
 
 @dataclass(frozen=True)
 class DetectConfig:
-    """How a bin is searched; lengths are shares of the object's diameter."""
+    """How a scene is searched; lengths are shares of the object's diameter."""
 
-    search: SearchConfig = field(default_factory=SearchConfig)
-    verify: VerifyConfig = field(default_factory=VerifyConfig)
+    candidates: CandidateConfig = field(default_factory=CandidateConfig)
     select: SelectConfig = field(default_factory=SelectConfig)
-    most_points: int = 131_072  # of a scan: more are thinned out at random
-    seed_spacing: float = 0.4  # seeds are at most about so far apart
-    most_seeds: int = 128
+    rounds: int = 8  # at most; each spreads seeds over what no seed is near and no found pose explains
+    accepted: float = 0.5  # the probability from which on a pose explains points, and counts as found
+    reported: float = 0.1  # less probable poses are left out
+    considered: int = 128  # most probable poses that are compared with each other
+    explained: float = 0.05  # points so near to the surface of a found part need no other one
 
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
-        if self.most_points < _LEAST_POINTS or self.most_seeds < 1 or not self.seed_spacing > 0:
+        if self.rounds < 1 or not 0 <= self.reported <= self.accepted <= 1 or not self.explained > 0:
             raise InputError(
-                f"most_points = {self.most_points} must be at least {_LEAST_POINTS}, most_seeds = {self.most_seeds} at"
-                f" least 1, and seed_spacing = {self.seed_spacing} above zero"
+                f"rounds = {self.rounds} must be at least 1, reported = {self.reported} and accepted = {self.accepted}"
+                f" probabilities in this order, and explained = {self.explained} above zero"
             )
 
 
-class Candidates(NamedTuple):
-    """Poses of a part in the view's frame, each with its evidence; arrays on the host, lengths in the scan's unit."""
-
-    T_view_object: Float32[np.ndarray, "s 4 4"]
-    usable: Bool[np.ndarray, " s"]  # false where no pose was found, and for repeated seeds
-    seeds: Float32[np.ndarray, "s 3"]
-    evidence: Float32[np.ndarray, "s f"]  # see EVIDENCE
-    num_inliers: Int[np.ndarray, " s"]
-
-
-EVIDENCE = (
-    "explained",
-    "violated",
-    "occluded",
-    "unknown",
-    "confirmed",  # explained, of what was explained or violated
-    "fit",
-    "inlier_share",
-    "log_inliers",
-    "object_share",
-    "rms_error",
-)
-
-
-def find_candidates(
+def detect(
     model: Model,
+    calibration: Calibration,
     part: Part,
-    view: View,
-    foreground: Bool[np.ndarray, " n"],
+    scene: Scene,
     seed: int,
     config: DetectConfig,
     at: Float[np.ndarray, "k 3"] | None = None,
-) -> Candidates:
-    """Return a candidate for each of the seeds spread over the foreground, or of the points `at` (in the view's frame).
+    solver: Solver | None = None,
+    clock: Clock | None = None,
+) -> Detections:
+    """Return the copies of a part, whose lengths are in the scene's unit, in pick order.
 
-    The part's lengths are in the unit of the view. The same inputs and `seed` give the same bits on one device.
-    Raises InputError if the foreground is empty.
+    With places `at`, in the view's frame, only these are searched. The same inputs and `seed` give the same bits on
+    one device.
     """
-    if not foreground.any():
-        raise InputError("no point of the scan is left as foreground: check background, region and units")
-    rows = _thinned(view.points, foreground, seed, config.most_points)
-    if at is not None:  # what was pointed at stays
-        rows = np.union1d(rows, [_nearest_row(view.points, place) for place in at])
-    points, front = view.points[rows], foreground[rows]
-    scene, candidates = _padded(points, front)
-    if at is None:
-        count = _seed_count(points[front], config.seed_spacing * part.diameter, config.most_seeds)
-        chosen, real = _spread_seeds(scene, candidates, count)
-    else:
-        chosen, real = _nearest_rows(points, at)
-    arrays = part_arrays(
-        jnp.asarray(part.points),
-        jnp.asarray(part.normals),
-        jnp.asarray(part.features),
-        jnp.float32(part.diameter),
-        model.config.num_object_points,
+    clock = clock or Clock()
+    rounds: list[Candidates] = []
+    free = scene.foreground
+    while True:
+        with clock("search"):
+            seeds = seeds_over(scene, free, part, config.candidates) if at is None else seeds_at(scene, at)
+            rounds.append(find_candidates(model, part, scene, seeds, seed + len(rounds), config.candidates, solver))
+        joined = join(rounds)
+        if at is not None or len(rounds) == config.rounds:
+            break
+        with clock("coverage"):
+            probability = calibration.probability(joined.evidence)
+            accepted = joined.T_view_object[joined.usable & (probability >= config.accepted)]
+            near = config.candidates.seed_spacing / 2 * part.diameter
+            free = scene.foreground & ~_near_places(scene.points, np.asarray(joined.searched.crops.seed), near)
+            free &= ~_near_surface(scene.points, part, accepted, config.explained)
+            free = _crowded(scene.points, free, config.candidates.seed_spacing * part.diameter)
+        if not free.any():
+            break
+    with clock("selection"):
+        choice = _selected(joined, calibration, part, config)
+    if choice.kept.any():
+        with clock("refinement"):
+            rows = np.flatnonzero(choice.kept | choice.contenders)
+            joined = improved(model, part, scene, joined, rows, seed, config.candidates)
+        with clock("selection"):
+            choice = _selected(joined, calibration, part, config)
+    with clock("report"):
+        probability = calibration.probability(joined.evidence)
+        found = [
+            _detection(row, float(probability[row]), float(choice.gap[row]), joined, part, scene)
+            for row in np.flatnonzero(choice.kept).tolist()
+        ]
+        found.sort(key=lambda pose: -pose.probability * pose.visible_fraction)
+    reason = None if found else _reason(joined, part)
+    return Detections(part.name, scene.unit, tuple(found), clock.timing, reason, scene.warnings)
+
+
+def _selected(found: Candidates, calibration: Calibration, part: Part, config: DetectConfig) -> Selection:
+    """Choose among the most probable candidates."""
+    probability = calibration.probability(found.evidence)
+    possible = found.usable & (probability >= config.reported)
+    ranked = np.argsort(-np.where(possible, probability, -1), kind="stable")[: config.considered]
+    few = np.zeros_like(possible)
+    few[ranked] = possible[ranked]
+    return select(found.T_view_object, probability, few, part, config.select)
+
+
+def _near_places(
+    points: Float32[np.ndarray, "r 3"], places: Float32[np.ndarray, "s 3"], reach: float
+) -> Bool[np.ndarray, " r"]:
+    from scipy.spatial import cKDTree
+
+    return np.isfinite(cKDTree(places).query(points, distance_upper_bound=reach)[0])
+
+
+def _crowded(points: Float32[np.ndarray, "r 3"], free: Bool[np.ndarray, " r"], size: float) -> Bool[np.ndarray, " r"]:
+    """Return the free points but for stray ones: in their cell of that size there are too few for a crop."""
+    rows = np.flatnonzero(free)
+    cells = np.floor(points[rows] / size).astype(np.int64)
+    _, which, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    crowded = np.zeros_like(free)
+    crowded[rows[counts[which.reshape(-1)] >= _LEAST_CROWD]] = True
+    return crowded
+
+
+def _near_surface(
+    points: Float32[np.ndarray, "r 3"], part: Part, poses: Float32[np.ndarray, "k 4 4"], reach: float
+) -> Bool[np.ndarray, " r"]:
+    """Return which points lie on the surface of a part at one of the poses."""
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(part.points)
+    spacing = float(np.sqrt(part.area / len(part.points)))
+    near = np.zeros(len(points), dtype=bool)
+    center, radius = (part.minimum + part.maximum) / 2, float(np.linalg.norm(part.maximum - part.minimum)) / 2
+    for pose in poses.astype(np.float64):
+        offsets = points - (pose[:3, :3] @ center + pose[:3, 3])
+        rows = np.flatnonzero((offsets**2).sum(axis=1) < (radius + reach * part.diameter) ** 2)
+        local = (points[rows] - pose[:3, 3]) @ pose[:3, :3]
+        near[rows] |= tree.query(local)[0] < reach * part.diameter + spacing
+    return near
+
+
+def _detection(row: int, probability: float, gap: float, found: Candidates, part: Part, scene: Scene) -> Detection:
+    T_scene_view = scene.view.T_scene_view
+    pose = T_scene_view @ found.T_view_object[row].astype(np.float64)
+    pose = canonical_pose(pose, part.symmetries)
+    shares = {name: float(found.evidence[row, EVIDENCE.index(name)]) for name in _SHARES}
+    prediction = crop_prediction(found, row)
+
+    def to_scene(points: Float32[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+        return points @ T_scene_view[:3, :3].T + T_scene_view[:3, 3]
+
+    return Detection(
+        T_scene_object=pose,
+        probability=probability,
+        num_inliers=int(found.num_inliers[row]),
+        visible_fraction=1 - shares["occluded"],
+        runner_up_gap=gap,
+        seed=to_scene(np.asarray(found.searched.crops.seed[found.crop[row]])),
+        prediction=replace(prediction, points=to_scene(prediction.points).astype(np.float32)),
+        warnings=("the part is symmetric: of the poses that look the same, this is the canonical one",)
+        if part.is_symmetric
+        else (),
+        **shares,
     )
-    key = jax.random.key(seed)
-    found = search(
-        model.graphdef,
-        model.parameters,
-        arrays,
-        scene,
-        chosen,
-        key,
-        config.search,
-        model.config.num_scene_points,
-    )
-    count = _VERIFIED_POINTS
-    surfels = Surfels(jnp.asarray(part.points[:count]), jnp.asarray(part.normals[:count]), jnp.float32(part.area))
-    depth = jnp.asarray(view.depth)
-    agreed = _agreements(
-        found.T_scene_object, surfels, depth, view.intrinsics, jnp.float32(part.diameter), config=config.verify
-    )
-    host: tuple[Hypotheses, Agreement] = jax.device_get((found, agreed))
-    poses = np.asarray(host[0].T_scene_object)
-    return Candidates(
-        T_view_object=poses,
-        usable=np.asarray(host[0].found) & np.asarray(real),
-        seeds=points[np.asarray(chosen)],
-        evidence=_evidence(*host, part.diameter),
-        num_inliers=np.asarray(host[0].num_inliers),
-    )
 
 
-_spread_seeds = jax.jit(spread_seeds, static_argnames="count")
-_agreements = jax.jit(agreements, static_argnames="config")
+def canonical_pose(T_scene_object: Float[np.ndarray, "4 4"], symmetries: Symmetries) -> Float[np.ndarray, "4 4"]:
+    """Return, of the poses that look the same, the one whose axes are nearest to the scene's, as a proper rigid pose.
+
+    Nearest means the largest trace of the rotation; continuous symmetries are turned to it exactly.
+    """
+    rotation = _orthonormal(T_scene_object[:3, :3])
+    forms = [rotation @ other for other in symmetries.rotations]
+    for axis in symmetries.axes:
+        forms = [_turned_to_identity(form, axis) for form in forms]
+    best = max(range(len(forms)), key=lambda row: (round(float(np.trace(forms[row])), 6), -row))
+    result = np.eye(4)
+    result[:3, :3] = forms[best]
+    # The symmetry's centre stays where it is.
+    place = rotation @ symmetries.center + T_scene_object[:3, 3]
+    result[:3, 3] = place - forms[best] @ symmetries.center
+    return result
 
 
-def _evidence(found: Hypotheses, agreed: Agreement, diameter: float) -> Float32[np.ndarray, "s f"]:
-    explained, violated = np.asarray(agreed.explained), np.asarray(agreed.violated)
-    columns = {
-        "explained": explained,
-        "violated": violated,
-        "occluded": agreed.occluded,
-        "unknown": agreed.unknown,
-        "confirmed": explained / np.maximum(explained + violated, 1e-6),
-        "fit": found.fit,
-        "inlier_share": found.inlier_share,
-        "log_inliers": np.log1p(found.num_inliers),
-        "object_share": found.object_share,
-        "rms_error": np.asarray(found.rms_error) / diameter,
-    }
-    return np.stack([np.asarray(columns[name], dtype=np.float32) for name in EVIDENCE], axis=1)
+def _turned_to_identity(rotation: Float[np.ndarray, "3 3"], axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation followed, in the object's frame, by the turn about an axis that makes its trace largest."""
+    cross = np.cross(np.eye(3), axis)  # the matrix of the product with the axis, up to its sign
+    outer = np.outer(axis, axis)
+    cosine = float(np.trace(rotation) - axis @ rotation @ axis)
+    sine = float(np.trace(rotation @ cross.T))
+    angle = np.arctan2(sine, cosine)
+    turn = outer + np.cos(angle) * (np.eye(3) - outer) + np.sin(angle) * cross.T
+    return rotation @ turn
 
 
-def _thinned(
-    points: Float32[np.ndarray, "n 3"], foreground: Bool[np.ndarray, " n"], seed: int, most: int
-) -> Int[np.ndarray, " k"]:
-    """Return the rows of a random part of the points, in their order; all if they are few."""
-    if len(points) <= most:
-        return np.arange(len(points))
-    kept = np.random.default_rng(seed).choice(len(points), most, replace=False)
-    kept.sort()
-    if not foreground[kept].any():  # then the foreground is small: it stays whole
-        kept = np.union1d(kept[: most // 2], np.flatnonzero(foreground)[: most // 2])
-    return kept
+def _orthonormal(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """Return the nearest rotation: float32 leaves errors of 1e-6."""
+    left, _, right = np.linalg.svd(rotation)
+    return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
 
 
-def _padded(points: Float32[np.ndarray, "n 3"], front: Bool[np.ndarray, " n"]) -> tuple[SceneArrays, Array]:
-    capacity = max(_LEAST_POINTS, 1 << (len(points) - 1).bit_length())
-    padded = np.zeros((capacity, 3), dtype=np.float32)
-    padded[: len(points)] = points
-    flags = np.zeros(capacity, dtype=bool)
-    flags[: len(points)] = front
-    mask = np.arange(capacity) < len(points)
-    return SceneArrays(jnp.asarray(padded), jnp.asarray(mask)), jnp.asarray(flags)
-
-
-def _seed_count(points: Float32[np.ndarray, "n 3"], spacing: float, most: int) -> int:
-    """Return about how many seeds it takes: the cells of a grid that hold points."""
-    cells = len(np.unique(np.floor(points / spacing).astype(np.int64), axis=0))
-    wanted = min(cells, most)
-    return next((count for count in _SEEDS if count >= wanted), _SEEDS[-1])
-
-
-def _nearest_rows(points: Float32[np.ndarray, "n 3"], at: Float[np.ndarray, "k 3"]) -> tuple[Array, Array]:
-    rows = [_nearest_row(points, place) for place in at]
-    count = next((size for size in _SEEDS if size >= len(rows)), len(rows))
-    real = np.arange(count) < len(rows)
-    return jnp.asarray(rows + rows[:1] * (count - len(rows)), dtype=jnp.int32), jnp.asarray(real)
-
-
-def _nearest_row(points: Float32[np.ndarray, "n 3"], place: Float[np.ndarray, "3"]) -> int:
-    return int(((points - place) ** 2).sum(axis=1).argmin())
+def _reason(found: Candidates, part: Part) -> str:
+    """Say why nothing is reported."""
+    if not found.usable.any():
+        return f"no pose of {part.name} agrees with any of the {len(found.usable)} places that were searched"
+    return f"none of the {int(found.usable.sum())} poses that were found is probable: {part.name} may not be there"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax
@@ -15,6 +15,7 @@ from safetensors.numpy import save
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.cad import ObjectModel
+from kmn_jax.data.mesh_files import METRES, check_unit
 from kmn_jax.data.symmetry import Symmetries
 from kmn_jax.files import read_safetensors, write_whole
 from kmn_jax.models import Model, encode_object
@@ -53,6 +54,22 @@ class Part:
     def is_symmetric(self) -> bool:
         """Whether another pose than the given one looks the same."""
         return len(self.symmetries.rotations) > 1 or len(self.symmetries.axes) > 0
+
+    def in_unit(self, unit: str) -> Part:
+        """Return the same part with its lengths in another unit; the features do not depend on it."""
+        factor = METRES[self.unit] / METRES[check_unit(unit)]
+        if factor == 1:
+            return self
+        return replace(
+            self,
+            unit=unit,
+            points=(self.points * factor).astype(np.float32),
+            diameter=self.diameter * factor,
+            minimum=self.minimum * factor,
+            maximum=self.maximum * factor,
+            area=self.area * factor**2,
+            symmetries=replace(self.symmetries, center=self.symmetries.center * factor),
+        )
 
 
 def model_digest(model: Model) -> str:
@@ -119,11 +136,6 @@ def save_part(part: Part, path: str | Path) -> None:
             f"the card of {part.name} would have {len(content)} bytes, more than {_LIMIT}: take fewer points"
         )
     write_whole(path, content)
-
-
-def is_card(path: str | Path) -> bool:
-    """Tell by its name whether a file is an object card."""
-    return Path(path).suffix.lower() == ".kmn"
 
 
 def load_part(path: str | Path, digest: str | None = None) -> Part:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,28 +15,31 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from kmn_jax.data.crops import CropConfig, crop_around
 from kmn_jax.data.splat import BIN, VisiblePoints
 from kmn_jax.geometry import farthest_point_indices
-from kmn_jax.pose import IcpConfig, MatchConfig, RansacConfig, find_matches, icp, ransac
-from kmn_jax.typing import Points, Pose, PRNGKey, Scalar
+from kmn_jax.pose import IcpConfig, MatchConfig, PoseResult, RansacConfig, find_matches, icp, ransac_modes
+from kmn_jax.typing import PRNGKey, Scalar
+
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
 class SearchConfig:
     """How poses are searched around a seed; lengths are shares of the object's diameter."""
 
-    matches: MatchConfig = field(default_factory=MatchConfig)
+    matches: MatchConfig = field(default_factory=lambda: MatchConfig(capacity=1024))
     ransac: RansacConfig = field(default_factory=RansacConfig)
-    icp: IcpConfig = field(default_factory=IcpConfig)
+    num_modes: int = 3  # poses of a crop that are refined
+    icp: IcpConfig = field(default_factory=lambda: IcpConfig(iterations=12))
+    icp_points: int = 256  # of a crop, on the object
     normal_radius: float = 0.06
     normal_points: int = 4096  # drawn around a seed for normals; the network's number of them is the crop
 
 
 class PartArrays(NamedTuple):
-    """What a search needs of an object, in the scene's unit."""
+    """What a search needs of an object, in the scene's unit; the first K points are the keypoints."""
 
     points: Float[Array, "m 3"]
+    normals: Float[Array, "m 3"]
     features: Float[Array, "k o"]
-    keypoints: Float[Array, "k 3"]
-    keypoint_normals: Float[Array, "k 3"]
     diameter: Scalar
 
 
@@ -46,17 +50,31 @@ class SceneArrays(NamedTuple):
     mask: Bool[Array, " r"]
 
 
-class Hypotheses(NamedTuple):
-    """A pose for each of s seeds, and what speaks for it; lengths in the scene's unit."""
+class CropFeatures(NamedTuple):
+    """Crops around s seeds, as the network sees them; points are relative to the seed, in the scene's axes and unit."""
 
-    T_scene_object: Float[Array, "s 4 4"]
-    found: Bool[Array, " s"]  # whether there is a pose at all
-    num_inliers: Int[Array, " s"]  # matches that agree on it
-    inlier_share: Float[Array, " s"]  # of the usable matches
-    num_object_points: Int[Array, " s"]  # of the crop that the network takes for the seed's instance
-    object_share: Float[Array, " s"]  # of the crop's points
-    fit: Float[Array, " s"]  # share of those points that the refined pose meets
-    rms_error: Float[Array, " s"]
+    points: Float[Array, "s n 3"]
+    normals: Float[Array, "s n 3"]
+    mask: Bool[Array, "s n"]
+    seed: Float[Array, "s 3"]
+    valid: Bool[Array, " s"]  # whether enough points are around the seed
+    features: Float[Array, "s n f"]
+
+
+class Hypotheses(NamedTuple):
+    """h poses for each of s seeds, in the scene's frame and unit."""
+
+    T_scene_object: Float[Array, "s h 4 4"]  # the identity where there is none
+    found: Bool[Array, "s h"]
+    num_inliers: Int[Array, "s h"]  # matches that agree on it
+    inlier_share: Float[Array, "s h"]  # of the usable matches
+
+
+class Predictions(NamedTuple):
+    """What the network says of the n points of s crops."""
+
+    on_object: Bool[Array, "s n"]  # taken for the seed's instance
+    scores: Float[Array, "s n k"]  # of the keypoints, 1 in sum
 
 
 def spread_seeds(
@@ -76,17 +94,23 @@ def spread_seeds(
 
 
 @partial(jax.jit, static_argnames=("graphdef", "config", "num_points"))
-def search(
+def crop_features(
     graphdef: nnx.GraphDef,
     parameters: nnx.State,
-    part: PartArrays,
     scene: SceneArrays,
     seeds: Int[Array, " s"],
+    real: Bool[Array, " s"],
+    length: Scalar,
     key: PRNGKey,
     config: SearchConfig,
     num_points: int,
-) -> Hypotheses:
-    """Return the best pose around each seed row of the scene."""
+) -> CropFeatures:
+    """Return the features of crops of radius `length`, an object's diameter, around seed rows of the scene.
+
+    Where `real` is false the crop is empty and not valid.
+    """
+    network = nnx.merge(graphdef, parameters)
+    visible = as_visible(scene)
     crops = CropConfig(
         num_points=num_points,
         max_noise=0.0,
@@ -95,77 +119,96 @@ def search(
         min_points=min(16, num_points),
     )
 
-    def one(seed: Int[Array, ""], key: Key[Array, ""]) -> Hypotheses:
-        return _hypothesis(graphdef, parameters, part, scene, seed, key, config, crops)
+    def one(seed: Int[Array, ""], key: Key[Array, ""]) -> CropFeatures:
+        crop = crop_around(key, visible, seed, scene.mask[seed], jnp.zeros((1, 3)), jnp.eye(4)[None], length, crops)
+        cloud = jnp.concatenate([crop.points, crop.normals], axis=1)
+        features = network.encode_scene(cloud, length, crop.mask)
+        return CropFeatures(crop.points, crop.normals, crop.mask, crop.seed, crop.valid, features)
 
-    keys = jax.random.split(key, seeds.shape[0])
-    # One after the other on CPUs, where side by side what is computed leaves the cache.
-    return jax.lax.platform_dependent(
-        seeds, keys, cpu=lambda s, k: jax.lax.map(lambda pair: one(*pair), (s, k)), default=jax.vmap(one)
-    )
+    return each(one, real, seeds, jax.random.split(key, seeds.shape[0]))
 
 
-def _hypothesis(
+@partial(jax.jit, static_argnames=("graphdef", "config"))
+def search(
     graphdef: nnx.GraphDef,
     parameters: nnx.State,
     part: PartArrays,
-    scene: SceneArrays,
-    seed: Int[Array, ""],
-    key: Key[Array, ""],
+    crops: CropFeatures,
+    key: PRNGKey,
     config: SearchConfig,
-    crops: CropConfig,
-) -> Hypotheses:
+) -> tuple[Hypotheses, Predictions]:
+    """Return the best poses of a part in each valid crop, and what the network says of its points."""
     network = nnx.merge(graphdef, parameters)
-    crop_key, pose_key = jax.random.split(key)
-    crop = crop_around(
-        crop_key,
-        _as_visible(scene),
-        seed,
-        scene.mask[seed],
-        jnp.zeros((1, 3)),
-        jnp.eye(4)[None],
-        part.diameter,
-        crops,
-    )
-    cloud = jnp.concatenate([crop.points, crop.normals], axis=1)
-    features = network.encode_scene(cloud, part.diameter, crop.mask)
-    segmentation, logits = network.match(features, part.features, crop.mask)
-    matches = find_matches(
-        segmentation,
-        logits,
-        crop.points,
-        crop.normals,
-        part.keypoints,
-        part.keypoint_normals,
-        part.diameter,
-        crop.mask,
-        config.matches,
-    )
-    coarse = ransac(pose_key, matches, config.ransac)
-    on_object = crop.mask & (segmentation[:, 1] > segmentation[:, 0])
-    fine = icp(
-        part.points,
-        crop.points,
-        coarse.T_scene_object,
-        part.diameter,
-        scene_normals=crop.normals,
-        scene_mask=on_object,
-        config=config.icp,
-    )
-    count = on_object.sum(dtype=jnp.int32)
-    return Hypotheses(
-        T_scene_object=_moved(fine.T_scene_object, crop.seed),
-        found=crop.valid & coarse.converged,
-        num_inliers=coarse.num_inliers,
-        inlier_share=coarse.score,
-        num_object_points=count,
-        object_share=count / jnp.maximum(crop.mask.sum(), 1),
-        fit=fine.score,
-        rms_error=fine.rms_error,
+    num_keypoints = part.features.shape[0]
+    keypoints, keypoint_normals = part.points[:num_keypoints], part.normals[:num_keypoints]
+
+    def one(crop: CropFeatures, key: Key[Array, ""]) -> tuple[Hypotheses, Predictions]:
+        segmentation, logits = network.match(crop.features, part.features, crop.mask)
+        matches = find_matches(
+            segmentation,
+            logits,
+            crop.points,
+            crop.normals,
+            keypoints,
+            keypoint_normals,
+            part.diameter,
+            crop.mask,
+            config.matches,
+        )
+        on_object = crop.mask & (segmentation[:, 1] > segmentation[:, 0])
+        coarse = ransac_modes(key, matches, config.num_modes, config.ransac)
+        rows, real = spread_rows(on_object, config.icp_points)
+
+        def refined(coarse: PoseResult) -> Hypotheses:
+            fine = icp(
+                part.points,
+                crop.points[rows],
+                coarse.T_scene_object,
+                part.diameter,
+                scene_normals=crop.normals[rows],
+                scene_mask=real,
+                config=config.icp,
+            )
+            pose = fine.T_scene_object.at[:3, 3].add(crop.seed)
+            return Hypotheses(pose, coarse.converged, coarse.num_inliers, coarse.score)
+
+        found = jax.lax.platform_dependent(
+            coarse, cpu=lambda modes: jax.lax.map(refined, modes), default=jax.vmap(refined)
+        )
+        return found, Predictions(on_object, jax.nn.softmax(logits, axis=1))
+
+    found, predictions = each(one, crops.valid, crops, jax.random.split(key, crops.seed.shape[0]))
+    poses = jnp.where(found.found[:, :, None, None], found.T_scene_object, jnp.eye(4)[None, None])
+    return found._replace(T_scene_object=poses), predictions
+
+
+def spread_rows(mask: Bool[Array, " n"], count: int) -> tuple[Int[Array, " c"], Bool[Array, " c"]]:
+    """Return rows where a mask is true, evenly chosen among them if they are more than `count`, and which are real."""
+    count = min(count, mask.shape[0])
+    total = mask.sum(dtype=jnp.int32)
+    order = jnp.nonzero(mask, size=mask.shape[0], fill_value=0)[0]
+    place = jnp.arange(count, dtype=jnp.int32)
+    return order[jnp.where(total > count, place * total // count, place)], place < total
+
+
+def each(function: Callable[..., _Result], real: Bool[Array, " s"], *items: Any) -> _Result:
+    """Map over leading axes, to zeros where `real` is false.
+
+    On CPUs one item comes after the other, as side by side what is computed leaves the cache, and what is not real is
+    skipped.
+    """
+    first = jax.tree.map(lambda leaf: leaf[0], items)
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, *first))
+
+    def one(real: Bool[Array, ""], *item: Any) -> _Result:
+        return jax.lax.cond(real, function, lambda *item: zeros, *item)
+
+    return jax.lax.platform_dependent(
+        real, *items, cpu=lambda *items: jax.lax.map(lambda item: one(*item), items), default=jax.vmap(one)
     )
 
 
-def _as_visible(scene: SceneArrays) -> VisiblePoints:
+def as_visible(scene: SceneArrays) -> VisiblePoints:
     """Return a scan as visible points that all count alike."""
     return VisiblePoints(
         points=scene.points,
@@ -175,13 +218,3 @@ def _as_visible(scene: SceneArrays) -> VisiblePoints:
         mask=scene.mask,
         visible_fraction=jnp.ones(1),
     )
-
-
-def _moved(pose: Pose, offset: Float[Array, " 3"]) -> Pose:
-    return pose.at[:3, 3].add(offset)
-
-
-def part_arrays(points: Points, normals: Points, features: Array, diameter: Scalar, num_points: int) -> PartArrays:
-    """Return an object's arrays: its first points for refinement, the first K of them as keypoints."""
-    count = features.shape[0]
-    return PartArrays(points[:num_points], features, points[:count], normals[:count], diameter)

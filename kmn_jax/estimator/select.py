@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Float32
 
-from kmn_jax.data.symmetry import Symmetries, rotation_about
-from kmn_jax.geometry import nearest, transform_points
-from kmn_jax.geometry.se3 import inverse
+from kmn_jax.data.symmetry import Symmetries
+from kmn_jax.estimator.part import Part
+from kmn_jax.geometry import compose, inverse, nearest, transform_points
+from kmn_jax.pose import discretise_symmetry, mssd
 from kmn_jax.typing import Normals, Points, Scalar
 
+_LEAST_PAIRS = 256  # the smallest number that is compiled
+_ALIKE = 0.5  # cosine of normals
 _TURNS = 36  # of a continuous symmetry: 10 degrees, under which poses count as the same anyway
 
 
@@ -23,84 +27,109 @@ class SelectConfig:
 
     same_pose: float = 0.2  # poses whose surfaces are nowhere further apart are one
     depth: float = 0.05  # a point so far below another part's surface is inside of it
-    inside_share: float = 0.1  # of a part's points that may be inside of an accepted part
+    overlap: float = 0.15  # share of a part's points that may be inside of another part, or on the same surface
+    contest: float = 0.2  # difference of scores up to which another pose may turn out to be better
     num_points: int = 256  # on the surface, that are compared
 
 
 def symmetry_transforms(symmetries: Symmetries) -> Float[np.ndarray, "t 4 4"]:
     """Return all poses `T_object_object` under which the object looks the same, continuous ones in steps."""
-    center, rotations = symmetries.center, symmetries.rotations
+    result = symmetries.transforms
     for axis in symmetries.axes:
-        turns = np.stack([rotation_about(axis, 2 * np.pi * step / _TURNS) for step in range(_TURNS)])
-        rotations = np.einsum("tij,sjk->tsik", turns, rotations).reshape(-1, 3, 3)
-    result = np.tile(np.eye(4), (len(rotations), 1, 1))
-    result[:, :3, :3] = rotations
-    result[:, :3, 3] = center - rotations @ center
+        turns = np.asarray(discretise_symmetry(axis.astype(np.float32), symmetries.center.astype(np.float32), _TURNS))
+        result = np.einsum("tij,sjk->tsik", turns.astype(float), result).reshape(-1, 4, 4)
     return result.astype(np.float32)
 
 
-def pose_distances(
-    poses: Float[Array, "s 4 4"], points: Points, symmetries: Float[Array, "t 4 4"]
-) -> Float[Array, "s s"]:
-    """Return how far apart two poses hold a surface point at most, under the best symmetry (MSSD), for all pairs."""
-    placed = jax.vmap(lambda pose: transform_points(pose, points))(poses)
-    turned = jax.vmap(lambda symmetry: transform_points(symmetry, points))(symmetries)
+class Relations(NamedTuple):
+    """How the parts of p pairs of poses lie to each other."""
 
-    def to_all(pose: Float[Array, "4 4"]) -> Float[Array, " s"]:
-        forms = jax.vmap(lambda form: transform_points(pose, form))(turned)
-
-        def least(form: Points) -> Float[Array, " s"]:
-            return ((form[None] - placed) ** 2).sum(axis=2).max(axis=1)
-
-        return jnp.sqrt(jax.lax.map(least, forms).min(axis=0))
-
-    return jax.lax.map(to_all, poses)
+    distance: Float[Array, " p"]  # of the two poses: MSSD, symmetries forgiven
+    overlap: Float[Array, " p"]  # share of the points of one that is in or on the other, the larger of the two
 
 
-def inside_shares(poses: Float[Array, "s 4 4"], points: Points, normals: Normals, depth: Scalar) -> Float[Array, "s s"]:
-    """Return which share of the points of each part (row) is deeper than `depth` inside of each other (column)."""
-
-    def of(pose: Float[Array, "4 4"]) -> Float[Array, " s"]:
-        placed = transform_points(pose, points)
-
-        def within(other: Float[Array, "4 4"]) -> Scalar:
-            seen = transform_points(inverse(other), placed)
-            row, _ = nearest(seen, points)
-            below = ((seen - points[row]) * normals[row]).sum(axis=1)
-            return (below < -depth).mean()
-
-        return jax.lax.map(within, poses)
-
-    return jax.lax.map(of, poses)
-
-
-def accept(score: Float[Array, " s"], usable: Bool[Array, " s"], excluded: Bool[Array, "s s"]) -> Bool[Array, " s"]:
-    """Take hypotheses from the best score on, each unless one that was taken before excludes it.
-
-    Equal scores go by their order. `excluded` holds for a pair in either order.
-    """
-    excluded = excluded | excluded.T
-    order = jnp.argsort(-jnp.where(usable, score, -jnp.inf), stable=True)
-
-    def step(taken: Bool[Array, " s"], row: Array) -> tuple[Bool[Array, " s"], None]:
-        free = usable[row] & ~(excluded[row] & taken).any()
-        return taken.at[row].set(free), None
-
-    return jax.lax.scan(step, jnp.zeros_like(usable), order)[0]
-
-
-def select(
-    poses: Float[Array, "s 4 4"],
-    score: Float[Array, " s"],
-    usable: Bool[Array, " s"],
+@jax.jit
+def relations(
+    pairs: Float[Array, "p 2 4 4"],
     points: Points,
     normals: Normals,
     symmetries: Float[Array, "t 4 4"],
-    diameter: Scalar,
+    depth: Scalar,
+) -> Relations:
+    """Compare pairs of poses by points of the part's surface; `depth` is how far below a surface inside is."""
+
+    def share(pose: Float[Array, "4 4"], other: Float[Array, "4 4"]) -> Scalar:
+        between = compose(inverse(other), pose)
+        seen = transform_points(between, points)
+        row, distance = nearest(seen, points)
+        below = ((seen - points[row]) * normals[row]).sum(axis=1) < -depth
+        turned = jnp.matmul(normals, between[:3, :3].T, precision=jax.lax.Precision.HIGHEST)
+        alike = (turned * normals[row]).sum(axis=1) > _ALIKE  # where parts touch, they are opposite
+        return (below | ((distance <= depth) & alike)).mean()
+
+    def of(pair: Float[Array, "2 4 4"]) -> Relations:
+        one, other = pair
+        return Relations(mssd(one, other, points, symmetries), jnp.maximum(share(one, other), share(other, one)))
+
+    return jax.lax.map(of, pairs)
+
+
+def accept(
+    score: Float[np.ndarray, " s"], usable: Bool[np.ndarray, " s"], excluded: Bool[np.ndarray, "s s"]
+) -> Bool[np.ndarray, " s"]:
+    """Take hypotheses from the best score on, each unless one that was taken before excludes it.
+
+    Equal scores go by their order.
+    """
+    taken = np.zeros(len(score), dtype=bool)
+    for row in np.argsort(-score, kind="stable"):
+        taken[row] = usable[row] and not (excluded[row] & taken).any()
+    return taken
+
+
+class Selection(NamedTuple):
+    """Which hypotheses stand, and by how much each scores above the best other pose for its place."""
+
+    kept: Bool[np.ndarray, " s"]
+    gap: Float[np.ndarray, " s"]  # of what is kept; the score itself where nothing competes
+    contenders: Bool[np.ndarray, " s"]  # other poses for the places of what is kept, that score nearly as high
+
+
+def select(
+    poses: Float32[np.ndarray, "s 4 4"],
+    score: Float[np.ndarray, " s"],
+    usable: Bool[np.ndarray, " s"],
+    part: Part,
     config: SelectConfig,
-) -> Bool[Array, " s"]:
-    """Return which hypotheses to keep."""
-    points, normals = points[: config.num_points], normals[: config.num_points]
-    same = pose_distances(poses, points, symmetries) <= config.same_pose * diameter
-    inside = inside_shares(poses, points, normals, config.depth * diameter) > config.inside_share
-    return accept(score, usable, (same | inside) & ~jnp.eye(len(score), dtype=bool))
+) -> Selection:
+    """Choose among hypotheses with scores of zero and above."""
+    points, normals = part.points[: config.num_points], part.normals[: config.num_points]
+    middle = np.append((part.minimum + part.maximum) / 2, 1)
+    centers = (poses @ middle)[:, :3]
+    apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+    reach = float(np.linalg.norm(part.maximum - part.minimum))  # parts further apart do not touch
+    first, second = np.nonzero(np.triu((apart < reach) & usable[:, None] & usable[None], 1))
+    same, clash = np.zeros((2, len(poses), len(poses)), dtype=bool)
+    if len(first):
+        slots = max(_LEAST_PAIRS, 1 << (len(first) - 1).bit_length())  # few sizes are compiled
+        pairs = np.tile(np.eye(4, dtype=np.float32), (slots, 2, 1, 1))
+        pairs[: len(first), 0], pairs[: len(first), 1] = poses[first], poses[second]
+        transforms = symmetry_transforms(part.symmetries)
+        spare = (1 << (len(transforms) - 1).bit_length()) - len(transforms)
+        transforms = np.concatenate([transforms, np.tile(np.eye(4, dtype=np.float32), (spare, 1, 1))])
+        depth = jnp.float32(config.depth * part.diameter)
+        found: Any = jax.device_get(
+            relations(jnp.asarray(pairs), jnp.asarray(points), jnp.asarray(normals), jnp.asarray(transforms), depth)
+        )
+        same[first, second] = (found.distance <= config.same_pose * part.diameter)[: len(first)]
+        clash[first, second] = (found.overlap > config.overlap)[: len(first)]
+    same, clash = same | same.T, clash | clash.T
+    kept = accept(score, usable, same | clash)
+    # A pose that a better one has ruled out elsewhere is no rival here.
+    better = kept[:, None] & (same | clash) & (score[:, None] > score[None])
+    alone = better.sum(axis=0)[None] == better
+    rivals = clash & usable[None] & ~kept[None] & alone
+    gap = score - np.where(rivals, score[None], 0).max(axis=1, initial=0)
+    close = (kept[:, None] & clash & (score[:, None] - score[None] <= config.contest)).any(axis=0)
+    distinct = usable & close & ~kept & ~(same & kept[:, None]).any(axis=0)
+    return Selection(kept, gap, accept(score, distinct, same))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -49,10 +48,7 @@ def agreement(
 ) -> Agreement:
     """Compare an object at a pose with a depth image in the same unit, zero where nothing was measured."""
     seen = visible_by_splatting(surfels, T_camera_object[None], jnp.ones(1, dtype=bool), camera, None, config.splat)
-    x, y, z = (seen.points[:, axis] for axis in range(3))
-    safe = jnp.where(seen.mask, z, 1)
-    column = jnp.round(camera.fx * x / safe + camera.cx).astype(jnp.int32)
-    row = jnp.round(camera.fy * y / safe + camera.cy).astype(jnp.int32)
+    row, column, z = _pixels(seen.points, seen.mask, camera)
     measured = _window(depth, row, column, config.window)
     there = measured > 0
     gap = jnp.where(there, measured - z[:, None], 0)
@@ -88,29 +84,25 @@ def _window(
     return jnp.stack(values, axis=1)
 
 
+def _pixels(
+    points: Float[Array, "m 3"], ahead: Bool[Array, " m"], camera: Intrinsics
+) -> tuple[Int[Array, " m"], Int[Array, " m"], Float[Array, " m"]]:
+    """Return row and column of the nearest pixel, and the depth; any pixel where a point is not ahead."""
+    x, y, z = (points[:, axis] for axis in range(3))
+    safe = jnp.where(ahead, z, 1)
+    column = jnp.round(camera.fx * x / safe + camera.cx).astype(jnp.int32)
+    row = jnp.round(camera.fy * y / safe + camera.cy).astype(jnp.int32)
+    return row, column, z
+
+
 def depth_buffer(
     points: Float[Array, "r 3"], mask: Bool[Array, " r"], camera: Intrinsics, shape: tuple[int, int]
 ) -> Float[Array, "h w"]:
     """Return the depth image that a camera at the origin would have of points: the nearest one of every pixel."""
     height, width = shape
-    x, y, z = (points[:, axis] for axis in range(3))
-    ahead = mask & (z > 0)
-    safe = jnp.where(ahead, z, 1)
-    column = jnp.round(camera.fx * x / safe + camera.cx).astype(jnp.int32)
-    row = jnp.round(camera.fy * y / safe + camera.cy).astype(jnp.int32)
+    ahead = mask & (points[:, 2] > 0)
+    row, column, z = _pixels(points, ahead, camera)
     inside = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     index = jnp.where(inside, row * width + column, height * width)
     nearest = jnp.full(height * width, jnp.inf).at[index].min(jnp.where(inside, z, jnp.inf), mode="drop")
     return jnp.where(jnp.isfinite(nearest), nearest, 0).reshape(height, width)
-
-
-def agreements(
-    poses: Float[Array, "s 4 4"],
-    surfels: Surfels,
-    depth: Float[Array, "h w"],
-    camera: Intrinsics,
-    diameter: Scalar,
-    config: VerifyConfig,
-) -> Agreement:
-    """Return the agreement of several poses."""
-    return jax.lax.map(lambda pose: agreement(pose, surfels, depth, camera, diameter, config), poses)

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Array, Bool, Float, Float32, Int
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.scan_files import Scan
 from kmn_jax.data.scene import Camera
-from kmn_jax.data.splat import Intrinsics
+from kmn_jax.data.splat import intrinsics
 from kmn_jax.estimator.verify import depth_buffer
 
-_LARGEST = 1024  # pixels along a side of an image that is made of a cloud
+_SIDE = 1024  # pixels along both sides of an image that is made of a cloud: one size, so one compilation
 _SAMPLE = 2000  # points whose spacing is measured
 _NEAREST = 1e-3  # of the distance of the cloud: a sensor nearer than that to a point lies in the cloud
 
@@ -28,13 +28,7 @@ class View:
     points: Float32[np.ndarray, "n 3"]
     depth: Float32[np.ndarray, "h w"]  # zero where nothing was measured
     camera: Camera
-
-    @property
-    def intrinsics(self) -> Intrinsics:
-        """The camera's numbers as float32."""
-        camera = self.camera
-        numbers = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-        return Intrinsics(*(jnp.float32(number) for number in numbers))
+    rows: Int[np.ndarray, " n"]  # of the scan's points that are seen: all but those behind the sensor
 
 
 def view_of(scan: Scan, sensor: Float[np.ndarray, "3"] | None = None) -> View:
@@ -44,7 +38,7 @@ def view_of(scan: Scan, sensor: Float[np.ndarray, "3"] | None = None) -> View:
     InputError if the sensor's place lies among the points.
     """
     if scan.depth is not None and scan.camera is not None:
-        return View(np.eye(4), scan.points, scan.depth, scan.camera)
+        return View(np.eye(4), scan.points, scan.depth, scan.camera, np.arange(len(scan.points)))
     place = np.zeros(3) if sensor is None else np.asarray(sensor, dtype=np.float64)
     offsets = scan.points.astype(np.float64) - place
     distances = np.linalg.norm(offsets, axis=1)
@@ -54,13 +48,22 @@ def view_of(scan: Scan, sensor: Float[np.ndarray, "3"] | None = None) -> View:
     if distances.min() <= _NEAREST * typical or (points[:, 2] <= 0).mean() > 0.01:
         where = "the origin" if sensor is None else f"{tuple(float(x) for x in place)}"
         raise InputError(f"the sensor cannot have been at {where}, among the points: say where it was")
-    points = points[points[:, 2] > 0].astype(np.float32)
+    rows = np.flatnonzero(points[:, 2] > 0)
+    points = points[rows].astype(np.float32)
     camera = _fine_camera(points)
     T_scene_view = np.eye(4)
     T_scene_view[:3, :3], T_scene_view[:3, 3] = rotation.T, place
-    view = View(T_scene_view, points, np.zeros((camera.height, camera.width), np.float32), camera)
-    depth = _buffer(points, view.intrinsics, (camera.height, camera.width))
-    return View(T_scene_view, points, depth, camera)
+    padded, mask = padded_points(points)
+    depth = _depth_buffer(padded, mask, intrinsics(camera), shape=(camera.height, camera.width))
+    return View(T_scene_view, points, np.asarray(depth), camera, rows)
+
+
+def padded_points(points: Float32[np.ndarray, "n 3"], least: int = 2) -> tuple[Float[Array, "r 3"], Bool[Array, " r"]]:
+    """Return points with zeros after them, and which are real: few sizes, powers of two, are ever compiled for."""
+    capacity = max(least, 1 << (len(points) - 1).bit_length())
+    padded = np.zeros((capacity, 3), dtype=np.float32)
+    padded[: len(points)] = points
+    return jnp.asarray(padded), jnp.asarray(np.arange(capacity) < len(points))
 
 
 def _towards(direction: Float[np.ndarray, "3"], typical: float) -> Float[np.ndarray, "3 3"]:
@@ -77,31 +80,19 @@ def _towards(direction: Float[np.ndarray, "3"], typical: float) -> Float[np.ndar
 
 
 def _fine_camera(points: Float32[np.ndarray, "n 3"]) -> Camera:
-    """Return a camera that sees all points, with pixels as wide as points are apart."""
+    """Return a camera that sees all points, with pixels as wide as points are apart if it has enough of them."""
     from scipy.spatial import cKDTree
 
     directions = points[:, :2] / points[:, 2:]
     low, high = np.percentile(directions, 0.1, axis=0), np.percentile(directions, 99.9, axis=0)
     chosen = np.random.default_rng(0).permutation(len(points))[:_SAMPLE]
+    spacing = 0.0
     if len(points) > 1:
         apart = cKDTree(directions).query(directions[chosen], k=2)[0][:, 1]
         spacing = float(np.percentile(apart, 75))
-    else:
-        spacing = 0.0
-    extent = np.maximum(high - low, 1e-3)  # also of a single point
-    spacing = max(spacing, float(extent.max()) / _LARGEST, 1e-9)
-    width, height = (int(np.clip(np.ceil(size / spacing) + 1, 2, _LARGEST + 1)) for size in extent)
-    focal = 1 / spacing
-    return Camera(focal, focal, float(-low[0] * focal), float(-low[1] * focal), width, height)
+    extent = max(float((high - low).max()), 1e-3)  # also of a single point
+    focal = 1 / max(spacing, extent / (_SIDE - 2))
+    return Camera(focal, focal, float(1 - low[0] * focal), float(1 - low[1] * focal), _SIDE, _SIDE)
 
 
-def _buffer(
-    points: Float32[np.ndarray, "n 3"], camera: Intrinsics, shape: tuple[int, int]
-) -> Float32[np.ndarray, "h w"]:
-    count = len(points)
-    capacity = 1 << max(count - 1, 1).bit_length()  # few sizes are compiled
-    padded = np.zeros((capacity, 3), dtype=np.float32)
-    padded[:count] = points
-    mask: Bool[np.ndarray, " r"] = np.arange(capacity) < count
-    made = jax.jit(depth_buffer, static_argnums=3)(jnp.asarray(padded), jnp.asarray(mask), camera, shape)
-    return np.asarray(made)
+_depth_buffer = jax.jit(depth_buffer, static_argnames="shape")

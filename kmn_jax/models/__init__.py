@@ -13,7 +13,7 @@ from kmn_jax.models.keymatchnet import (
 )
 from kmn_jax.models.losses import LossConfig, MatchingLoss, keypoint_labels, matching_loss
 from kmn_jax.models.released import RELEASED_CONFIG, load_released, save_released
-from kmn_jax.models.weights import load_model, load_pretrained, save_model
+from kmn_jax.models.weights import load_model, load_pretrained, released_file, save_model
 
 __all__ = [
     "RELEASED_CONFIG",
@@ -33,6 +33,7 @@ __all__ = [
     "match",
     "matching_loss",
     "model_structure",
+    "released_file",
     "save_model",
     "save_released",
 ]

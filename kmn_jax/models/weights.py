@@ -37,8 +37,8 @@ def is_model_file(path: str | Path) -> bool:
         return False
 
 
-def load_pretrained(name: str = "small") -> Model:
-    """Load a released model, one of those in `kmn_jax/pretrained/`, where a card tells what it can do.
+def released_file(name: str) -> Path:
+    """Return the file of a released model, one of those in `kmn_jax/pretrained/`.
 
     Raises InputError if there is none of that name.
     """
@@ -47,7 +47,12 @@ def load_pretrained(name: str = "small") -> Model:
     if not path.is_file():
         names = ", ".join(sorted(file.stem for file in folder.glob("*.safetensors"))) or "none"
         raise InputError(f"there is no released model {name!r}: there are {names}")
-    return load_model(path)
+    return path
+
+
+def load_pretrained(name: str = "small") -> Model:
+    """Load a released model; a card beside its file tells what it can do. Raises InputError if there is none."""
+    return load_model(released_file(name))
 
 
 def load_model(path: str | Path) -> Model:

@@ -18,7 +18,7 @@ from kmn_jax.pose.metrics import (
     nearest_instance_error,
     recall,
 )
-from kmn_jax.pose.ransac import RansacConfig, ransac
+from kmn_jax.pose.ransac import RansacConfig, ransac, ransac_modes
 from kmn_jax.pose.result import PoseResult, PoseStatus
 
 __all__ = [
@@ -40,5 +40,6 @@ __all__ = [
     "mssd",
     "nearest_instance_error",
     "ransac",
+    "ransac_modes",
     "recall",
 ]

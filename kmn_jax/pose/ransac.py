@@ -40,6 +40,8 @@ class RansacConfig:
     num_refinements: int = 5
     min_inliers: int = 5
     min_inlier_share: float = 0.03
+    mode_degrees: float = 30.0  # poses that differ by more than this, or by `mode_distance`, are another mode
+    mode_distance: float = 0.15
 
     def __post_init__(self) -> None:
         """Refuse values that contradict each other or their meaning."""
@@ -58,6 +60,11 @@ class RansacConfig:
             raise ValueError(f"min_inliers is {self.min_inliers}, but any three matches agree: ask for more")
         if not 0 <= self.min_inlier_share <= 1:
             raise ValueError(f"min_inlier_share is {self.min_inlier_share}, but must be in [0, 1]")
+        if not 0 < self.mode_degrees < 180 or not self.mode_distance > 0:
+            raise ValueError(
+                f"mode_degrees is {self.mode_degrees}, but must be in (0, 180), and mode_distance is"
+                f" {self.mode_distance}, but must be above zero"
+            )
 
     @property
     def refinement_gates(self) -> tuple[float, ...]:
@@ -85,10 +92,25 @@ def ransac(key: ArrayInput, matches: Matches, config: RansacConfig = RansacConfi
     """
     key, matches = _checked_key(key), _checked_matches(matches)
     if matches.mask.shape[0] > 0:
-        return _ransac(key, matches, config)
+        return _first(_ransac(key, matches, config, 1))
     padding = {name: jnp.zeros((1, *getattr(matches, name).shape[1:])) for name in Matches._fields[:5]}
-    result = _ransac(key, matches._replace(**padding, mask=jnp.zeros(1, dtype=bool)), config)
+    result = _first(_ransac(key, matches._replace(**padding, mask=jnp.zeros(1, dtype=bool)), config, 1))
     return result._replace(inlier_mask=result.inlier_mask[:0])
+
+
+def ransac_modes(key: ArrayInput, matches: Matches, count: int, config: RansacConfig = RansacConfig()) -> PoseResult:
+    """Return `count` poses that differ, best first, with a leading axis in all fields: what `ransac` chose among.
+
+    Each is the best one left whose rotation differs by more than `mode_degrees`, or whose place of the matched points'
+    mean by more than `mode_distance` diameters, from those before. Nearly symmetric parts have several; which one is
+    right is for the surface to say. The first is that of `ransac`. Errors as there, and for a count below 1.
+    """
+    if count < 1:
+        raise InputError(f"count is {count}, but at least one pose is needed")
+    key, matches = _checked_key(key), _checked_matches(matches)
+    if not matches.mask.shape[0]:
+        raise InputError("matches is empty: pad it, with a mask, to at least one row")
+    return _ransac(key, matches, config, count)
 
 
 def _checked_key(key: ArrayInput) -> jax.Array:
@@ -125,8 +147,12 @@ def _checked_matches(matches: Matches) -> Matches:
     )
 
 
-@partial(jax.jit, static_argnames="config")
-def _ransac(key: PRNGKey, matches: Matches, config: RansacConfig) -> PoseResult:
+def _first(modes: PoseResult) -> PoseResult:
+    return jax.tree.map(lambda leaf: leaf[0], modes)
+
+
+@partial(jax.jit, static_argnames=("config", "num_modes"))
+def _ransac(key: PRNGKey, matches: Matches, config: RansacConfig, num_modes: int) -> PoseResult:
     diameter = matches.object_diameter
     input_is_valid = jnp.isfinite(diameter) & (diameter > 0)
     unit = jnp.where(input_is_valid, diameter, 1)
@@ -159,7 +185,13 @@ def _ransac(key: PRNGKey, matches: Matches, config: RansacConfig) -> PoseResult:
         return agree, squares
 
     counts = jax.vmap(lambda pose: inliers(pose, config.distance_gate)[0].sum(dtype=jnp.int32))(poses)
-    best = poses[jnp.argmax(jnp.where(is_candidate, counts, -1))]
+    score = jnp.where(is_candidate, counts, -1)
+    modes, there = [], []
+    for _ in range(num_modes):
+        row = jnp.argmax(score)
+        modes.append(poses[row])
+        there.append(score[row] >= 0)
+        score = jnp.where(_differ(poses, poses[row], config), score, -1)
 
     def refine(pose: Pose, gate: Scalar) -> tuple[Pose, None]:
         inlier_weights = jnp.where(inliers(pose, gate)[0], weights, 0)
@@ -167,36 +199,47 @@ def _ransac(key: PRNGKey, matches: Matches, config: RansacConfig) -> PoseResult:
         # Kabsch always answers; with inliers on a line, or none, the answer would be arbitrary.
         return jnp.where(rotation_is_determined(object_points, inlier_weights), refined, pose), None
 
-    best, _ = jax.lax.scan(refine, best, jnp.array(config.refinement_gates, dtype=jnp.float32))
+    def finish(best: Pose, is_there: Bool[Array, ""]) -> PoseResult:
+        best, _ = jax.lax.scan(refine, best, jnp.array(config.refinement_gates, dtype=jnp.float32))
+        inlier_mask, squares = inliers(best, config.distance_gate)
+        num_inliers = inlier_mask.sum(dtype=jnp.int32)
+        share = jnp.ceil(config.min_inlier_share * num_usable.astype(jnp.float32)).astype(jnp.int32)
+        required = jnp.maximum(config.min_inliers, share)
+        spread = rotation_is_determined(object_points, jnp.where(inlier_mask, weights, 0))
+        pose = from_rotation_translation(
+            best[:3, :3], unit * best[:3, 3] + scene_centre - (best[:3, :3] * object_centre[None, :]).sum(axis=1)
+        )
+        conditions = [
+            (~input_is_valid, PoseStatus.INVALID_INPUT),
+            (num_usable < 3, PoseStatus.TOO_FEW_MATCHES),
+            (~is_candidate.any(), PoseStatus.DEGENERATE),
+            (~is_there | (num_inliers < required), PoseStatus.NO_CONSENSUS),
+            (~spread, PoseStatus.DEGENERATE),
+            (~jnp.isfinite(pose).all(), PoseStatus.INVALID_INPUT),
+        ]
+        codes = [jnp.int32(code) for _, code in conditions]
+        status = jnp.select([test for test, _ in conditions], codes, PoseStatus.OK)
+        converged = status == PoseStatus.OK
+        squared_error = jnp.where(inlier_mask, squares, 0).sum() / jnp.maximum(num_inliers, 1).astype(jnp.float32)
+        return PoseResult(
+            T_scene_object=jnp.where(converged, pose, jnp.eye(4, dtype=jnp.float32)),
+            score=jnp.where(converged, num_inliers / jnp.maximum(num_usable, 1), 0),
+            num_inliers=jnp.where(converged, num_inliers, 0),
+            rms_error=jnp.where(converged, unit * jnp.sqrt(squared_error), 0),
+            inlier_mask=inlier_mask & converged,
+            converged=converged,
+            status=status,
+        )
 
-    inlier_mask, squares = inliers(best, config.distance_gate)
-    num_inliers = inlier_mask.sum(dtype=jnp.int32)
-    share = jnp.ceil(config.min_inlier_share * num_usable.astype(jnp.float32)).astype(jnp.int32)
-    required = jnp.maximum(config.min_inliers, share)
-    spread = rotation_is_determined(object_points, jnp.where(inlier_mask, weights, 0))
-    pose = from_rotation_translation(
-        best[:3, :3], unit * best[:3, 3] + scene_centre - (best[:3, :3] * object_centre[None, :]).sum(axis=1)
-    )
-    conditions = [
-        (~input_is_valid, PoseStatus.INVALID_INPUT),
-        (num_usable < 3, PoseStatus.TOO_FEW_MATCHES),
-        (~is_candidate.any(), PoseStatus.DEGENERATE),
-        (num_inliers < required, PoseStatus.NO_CONSENSUS),
-        (~spread, PoseStatus.DEGENERATE),
-        (~jnp.isfinite(pose).all(), PoseStatus.INVALID_INPUT),
-    ]
-    status = jnp.select([test for test, _ in conditions], [jnp.int32(code) for _, code in conditions], PoseStatus.OK)
-    converged = status == PoseStatus.OK
-    squared_error = jnp.where(inlier_mask, squares, 0).sum() / jnp.maximum(num_inliers, 1).astype(jnp.float32)
-    return PoseResult(
-        T_scene_object=jnp.where(converged, pose, jnp.eye(4, dtype=jnp.float32)),
-        score=jnp.where(converged, num_inliers / jnp.maximum(num_usable, 1), 0),
-        num_inliers=jnp.where(converged, num_inliers, 0),
-        rms_error=jnp.where(converged, unit * jnp.sqrt(squared_error), 0),
-        inlier_mask=inlier_mask & converged,
-        converged=converged,
-        status=status,
-    )
+    return jax.vmap(finish)(jnp.stack(modes), jnp.stack(there))
+
+
+def _differ(poses: Float[Array, "h 4 4"], pose: Pose, config: RansacConfig) -> Bool[Array, " h"]:
+    """Return which poses of centred points, in diameters, are another mode than the given one."""
+    trace = (poses[:, :3, :3] * pose[None, :3, :3]).sum(axis=(1, 2))
+    turned = trace < 1 + 2 * cos(radians(config.mode_degrees))
+    moved = ((poses[:, :3, 3] - pose[None, :3, 3]) ** 2).sum(axis=1) > config.mode_distance**2
+    return turned | moved
 
 
 def _congruent_triplets(

@@ -14,7 +14,7 @@ from kmn_jax.estimator.search import (
     PartArrays,
     SceneArrays,
     SearchConfig,
-    part_arrays,
+    crop_features,
     search,
     spread_seeds,
 )
@@ -36,7 +36,7 @@ def model() -> Model:
 def part(model: Model) -> PartArrays:
     cloud = box_cloud(0, 128).astype(np.float32)
     features = encode_object(model, cloud[:64], np.arange(6), np.float32(2)).features
-    return part_arrays(jnp.asarray(cloud[:, :3]), jnp.asarray(cloud[:, 3:]), features, jnp.float32(2), 64)
+    return PartArrays(jnp.asarray(cloud[:64, :3]), jnp.asarray(cloud[:64, 3:]), features, jnp.float32(2))
 
 
 def scene(count: int = 700, capacity: int = 1024, seed: int = 0) -> SceneArrays:
@@ -46,10 +46,13 @@ def scene(count: int = 700, capacity: int = 1024, seed: int = 0) -> SceneArrays:
     return SceneArrays(jnp.asarray(points), jnp.arange(capacity) < count)
 
 
-def run(model: Model, part: PartArrays, where: SceneArrays, seeds: list[int], key: int = 0) -> Hypotheses:
-    return search(
-        model.graphdef, model.parameters, part, where, jnp.asarray(seeds, "i4"), jax.random.key(key), CONFIG, 64
+def run(model: Model, part: PartArrays, where: SceneArrays, seeds: list[int], real: int | None = None) -> Hypotheses:
+    rows, flags = jnp.asarray(seeds, "i4"), jnp.arange(len(seeds)) < (len(seeds) if real is None else real)
+    one, other = jax.random.split(jax.random.key(0))
+    crops = crop_features(
+        model.graphdef, model.parameters, where, rows, flags, part.diameter, one, CONFIG, num_points=64
     )
+    return search(model.graphdef, model.parameters, part, crops, other, CONFIG)
 
 
 def test_seeds_are_candidates_far_from_each_other() -> None:
@@ -95,6 +98,16 @@ def test_a_seed_among_nothing_gives_no_pose(model: Model, part: PartArrays) -> N
     found = run(model, part, SceneArrays(points, jnp.arange(1024) < 1), [0, 0, 0])
     assert not bool(found.found.any())
     assert bool(jnp.isfinite(found.T_scene_object).all())
+
+
+def test_seeds_that_are_not_real_are_skipped(model: Model, part: PartArrays) -> None:
+    all_three, first_two = (run(model, part, scene(), [5, 9, 60], real) for real in (3, 2))
+    assert bool(all_three.on_object[2].any())
+    assert not bool(first_two.found[2])
+    assert not bool(first_two.on_object[2].any())
+    np.testing.assert_array_equal(first_two.T_scene_object[2], np.eye(4))
+    for name in all_three._fields:
+        np.testing.assert_array_equal(getattr(all_three, name)[:2], getattr(first_two, name)[:2])
 
 
 def test_padding_changes_nothing(model: Model, part: PartArrays) -> None:

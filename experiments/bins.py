@@ -1,0 +1,99 @@
+"""Bins of a BOP dataset with ground truth, as scenes to search; and whether what was found there is right."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from kmn_jax.checks import InputError
+from kmn_jax.data.background import bin_content
+from kmn_jax.data.bop import BopDataset, BopFrame, FrameKey
+from kmn_jax.data.bop_crops import load_models
+from kmn_jax.data.cad import ObjectConfig
+from kmn_jax.data.scan_files import Scan
+from kmn_jax.data.scene import Bin, measured_points
+from kmn_jax.estimator.part import Part, make_part
+from kmn_jax.estimator.scene import Scene, make_scene
+from kmn_jax.estimator.view import View, view_of
+from kmn_jax.models import Model
+from kmn_jax.pose import adi
+
+_UNIT = "mm"
+_MOST_POINTS = 131_072
+_POINTS = 1000  # of an object's surface, for errors
+THRESHOLD = 0.1  # of the diameter: a pose with less ADI is right
+
+
+@dataclass(frozen=True)
+class BinImage:
+    """One image of a bin of one part, in millimetres and the camera's frame."""
+
+    key: FrameKey
+    part: Part
+    scene: Scene  # its foreground is what lies inside of the bin
+    truth: Float[np.ndarray, "i 4 4"]
+    visible: Float[np.ndarray, " i"]  # share of each copy that is seen
+    stranger: Part | None = None  # a part of about the same size of which there is no copy
+
+    def errors(self, poses: Float[np.ndarray, "s 4 4"]) -> Float[np.ndarray, "s i"]:
+        """Return the ADI of poses against each true one, in diameters."""
+        points = jnp.asarray(self.part.points[:_POINTS])
+        capacity = 1 << max(len(poses) * len(self.truth) - 1, 0).bit_length()
+        pairs = np.stack(np.broadcast_arrays(poses[:, None], self.truth[None]), axis=2).reshape(-1, 2, 4, 4)
+        padded = np.concatenate([pairs, np.tile(np.eye(4), (capacity - len(pairs), 2, 1, 1))]).astype(np.float32)
+        found = np.asarray(_adi_of_pairs(padded, points))[: len(pairs)]
+        return found.reshape(len(poses), len(self.truth)) / self.part.diameter
+
+
+@jax.jit
+def _adi_of_pairs(pairs: jax.Array, points: jax.Array) -> jax.Array:
+    return jax.lax.map(lambda pair: adi(pair[0], pair[1], points), pairs)
+
+
+def bin_images(folder: Path, split: str, model: Model, every: int = 1) -> Iterator[BinImage]:
+    """Yield every so many images of a dataset whose bins hold copies of one part each.
+
+    Raises InputError if the folder is no such dataset.
+    """
+    dataset = BopDataset.open(folder, split, unit=_UNIT)
+    models, problems = load_models(dataset, ObjectConfig(num_points=4096))
+    if problems:
+        raise InputError(f"{folder}: {problems[0]}")
+    parts = {object_id: make_part(found, model) for object_id, found in models.items()}
+    for key in dataset.keys[::every]:
+        frame = dataset.frame(*key, masks=True).with_visibility()
+        instances = frame.instances or ()
+        if not instances or frame.bin is None or frame.T_camera_bin is None:
+            raise InputError(f"{folder}: image {key.image_id} of scene {key.scene_id} has no poses or no bin")
+        object_id = instances[0].object_id
+        part = parts[object_id]
+        yield BinImage(
+            key,
+            part,
+            make_scene(_view(frame), _UNIT, _inside(frame, frame.bin, frame.T_camera_bin, part), _MOST_POINTS),
+            np.stack([instance.T_camera_object for instance in instances]),
+            np.array([instance.visible_fraction or 0.0 for instance in instances]),
+            min(
+                (other for other_id, other in parts.items() if other_id != object_id),
+                key=lambda other: abs(np.log(other.diameter / part.diameter)),
+                default=None,
+            ),
+        )
+
+
+def _view(frame: BopFrame) -> View:
+    depth = frame.depth.astype(np.float32)
+    return view_of(Scan(measured_points(depth, frame.camera), None, depth, frame.camera, _UNIT))
+
+
+def _inside(frame: BopFrame, bin: Bin, T_camera_bin: Float[np.ndarray, "4 4"], part: Part) -> Bool[np.ndarray, " n"]:
+    """Return which measured points lie inside of the bin; all if none does."""
+    content = np.asarray(bin_content(frame.depth, frame.camera, T_camera_bin, bin, part.diameter))
+    inside = content[frame.depth > 0]
+    return inside if inside.any() else np.ones_like(inside)

@@ -1,0 +1,235 @@
+"""The estimator: parts prepared once, scans given as files or arrays, poses out as plain records."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeAlias, overload
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from kmn_jax.checks import InputError, float_array
+from kmn_jax.data.cad import ObjectConfig, ObjectModel, load_object, object_from_cloud, object_from_mesh
+from kmn_jax.data.foreground import ForegroundOptions, foreground
+from kmn_jax.data.mesh_files import check_unit
+from kmn_jax.data.scan_files import Scan, read_scan
+from kmn_jax.data.units import length_problem, scene_size
+from kmn_jax.estimator.calibrate import Calibration, load_calibration
+from kmn_jax.estimator.detect import DetectConfig, detect
+from kmn_jax.estimator.evidence import EVIDENCE
+from kmn_jax.estimator.part import Part, load_part, make_part, model_digest
+from kmn_jax.estimator.result import Detections
+from kmn_jax.estimator.scene import Scene, make_scene
+from kmn_jax.estimator.timing import Clock
+from kmn_jax.estimator.view import View, view_of
+from kmn_jax.models import Model, load_model, released_file
+
+PartSource: TypeAlias = Any  # see PoseEstimator.prepare
+ScanSource: TypeAlias = str | Path | np.ndarray | Scan
+
+_UNFITTED = "the probabilities were fitted for other weights: fit them with experiments.calibrate"
+_NUM_POINTS = 4096  # on a part's surface
+_CARD = ".kmn"
+
+
+@dataclass(frozen=True)
+class PoseEstimator:
+    """Find copies of parts in scans. Make it by `from_pretrained`."""
+
+    model: Model
+    digest: str  # of the model
+    calibration: Calibration
+    config: DetectConfig = field(default_factory=DetectConfig)
+    warnings: tuple[str, ...] = ()  # go with every result
+
+    @classmethod
+    def from_pretrained(cls, weights: str | Path = "small", config: DetectConfig | None = None) -> PoseEstimator:
+        """Load a released network by its name, or one's own by its .safetensors file.
+
+        Probabilities are those of the calibration beside the file (NAME.calibration.json); without one, those of the
+        released network `small`, and each result says so. Raises InputError if there is no such network.
+        """
+        path = Path(weights) if Path(weights).suffix == ".safetensors" else released_file(str(weights))
+        model = load_model(path)
+        fitted = path.with_suffix(".calibration.json")
+        own = fitted.is_file()
+        calibration = load_calibration(
+            fitted if own else released_file("small").with_suffix(".calibration.json"), EVIDENCE
+        )
+        return cls(model, model_digest(model), calibration, config or DetectConfig(), () if own else (_UNFITTED,))
+
+    def prepare(self, source: PartSource, unit: str | None = None, name: str | None = None) -> Part:
+        """Make a part of a CAD file, a cloud that covers the whole surface, a mesh or an object card.
+
+        `source` is a path (STL, OBJ, PLY, GLB, STEP, PCD, XYZ, or .kmn, a card), an array (n, 3) or (n, 6) of points
+        and normals, a pair of vertices (v, 3) and triangles (t, 3), or anything with `vertices` and `faces`. `unit`
+        is that of its lengths: by default the file's own, else millimetres. Raises InputError if there is no surface
+        in it.
+        """
+        if isinstance(source, str | Path) and Path(source).suffix.lower() == _CARD:
+            return load_part(source, self.digest)
+        return make_part(_object(source, unit, name), self.model, self.digest)
+
+    def scene(
+        self,
+        scan: ScanSource,
+        part: Part,
+        *,
+        unit: str | None = None,
+        camera: str | Path | None = None,
+        sensor: Float[np.ndarray, "3"] | None = None,
+        at: Float[np.ndarray, "k 3"] | None = None,
+        background: ForegroundOptions | None = None,
+    ) -> Scene:
+        """Make a scan ready for searches of a part, or of several of about its size.
+
+        `scan` is a file, points (n, 3) in the sensor's frame or a `Scan`; `unit` is that of its lengths, by default
+        the part's. `sensor` is where it was measured from, by default the origin, and points nearest to places `at`
+        are kept whatever is thinned out, both in the scan's frame. Raises InputError if lengths of part and scan
+        cannot belong together, or if nothing of the scan is foreground.
+        """
+        read = _scan(scan, unit or part.unit, camera)
+        problem = length_problem(part.diameter, part.unit, scene_size(read))
+        if problem is not None:
+            raise InputError(problem)
+        view = view_of(read, sensor)
+        diameter = part.in_unit(read.unit).diameter
+        front, warnings = _foreground(read, view, diameter, background or ForegroundOptions())
+        places = None if at is None else _to_view(at, view.T_scene_view)
+        most = self.config.candidates.most_points
+        return make_scene(view, read.unit, front, most, places, (*self.warnings, *warnings))
+
+    @overload
+    def detect(self, part: Part, scan: ScanSource | Scene, **options: Any) -> Detections: ...
+
+    @overload
+    def detect(self, part: Sequence[Part], scan: ScanSource | Scene, **options: Any) -> tuple[Detections, ...]: ...
+
+    def detect(
+        self,
+        part: Part | Sequence[Part],
+        scan: ScanSource | Scene,
+        *,
+        seed: int = 0,
+        at: Float[np.ndarray, "k 3"] | None = None,
+        top: int | None = None,
+        clock: Clock | None = None,
+        **options: Any,
+    ) -> Detections | tuple[Detections, ...]:
+        """Return the copies of a part in a scan, in pick order; of several parts, one result for each.
+
+        Several parts share the scene, and where their diameters agree the features of its crops. `at` restricts the
+        search to places (k, 3) in the scan's frame, `top` the result to the first poses; `options` go to `scene`
+        unless the scan is one already. `clock` has timed what came before. The same inputs and `seed` give the same
+        bits on one device.
+        """
+        parts = [part] if isinstance(part, Part) else list(part)
+        if not parts:
+            return ()
+        for one in parts:
+            if one.model_digest != self.digest:
+                raise InputError(f"the part {one.name} was prepared with other weights: prepare it with this estimator")
+        clock = clock or Clock()
+        places = None if at is None else np.atleast_2d(np.asarray(float_array(at, "at", (None, 3)), dtype=float))
+        if isinstance(scan, Scene):
+            scene = scan
+        else:
+            with clock("scene"):
+                smallest = min(parts, key=lambda one: one.in_unit("m").diameter)
+                scene = self.scene(scan, smallest, at=places, **options)
+        in_view = None if places is None else _to_view(places, scene.view.T_scene_view)
+        results = []
+        for one in parts:
+            found = detect(
+                self.model,
+                self.calibration,
+                one.in_unit(scene.unit),
+                scene,
+                seed,
+                self.config,
+                in_view,
+                clock=clock,
+            )
+            results.append(replace(found, poses=found.poses[:top]))
+            clock = Clock()
+        return results[0] if isinstance(part, Part) else tuple(results)
+
+    def estimate(
+        self,
+        part: Part,
+        crop: Float[np.ndarray, "n 3"] | Sequence[Float[np.ndarray, "n 3"]],
+        *,
+        seed: int = 0,
+        unit: str | None = None,
+    ) -> Detections | tuple[Detections, ...]:
+        """Return the pose of the copy in the middle of a crop, its first point; of several crops, one result each.
+
+        A crop is points (n, 3) in the sensor's frame around a picked point, which is its first row; more than a
+        diameter away from it they are not used. There is one pose or none.
+        """
+        single = isinstance(crop, np.ndarray) and crop.ndim == 2
+        crops = [crop] if single else list(crop)
+        keep_all = ForegroundOptions(remove_plane="never")
+        results = []
+        for points in crops:
+            points = np.asarray(float_array(points, "crop", (None, 3)), dtype=np.float32)
+            if not len(points):
+                raise InputError("crop is empty: at least one point is needed")
+            results.append(self.detect(part, points, seed=seed, at=points[:1], top=1, unit=unit, background=keep_all))
+        return results[0] if single else tuple(results)
+
+
+def _foreground(
+    scan: Scan, view: View, diameter: float, options: ForegroundOptions
+) -> tuple[Bool[np.ndarray, " n"], tuple[str, ...]]:
+    """Return which points of a view are foreground; planes and what is behind them are as its sensor saw them."""
+    if len(view.rows) == len(scan.points) and np.array_equal(view.T_scene_view, np.eye(4)):
+        return foreground(scan, diameter, options)
+    region = replace(options, background=None, remove_plane="never")
+    inside, _ = foreground(scan, diameter, region)
+    empty = options.background
+    if empty is not None:
+        empty = replace(empty, points=_to_view(empty.points, view.T_scene_view).astype(np.float32), depth=None)
+    rows = np.flatnonzero(inside[view.rows])
+    seen = Scan(view.points[rows], None, None, None, scan.unit)
+    front, warnings = foreground(seen, diameter, replace(options, roi=None, background=empty))
+    result = np.zeros(len(view.points), dtype=bool)
+    result[rows[front]] = True
+    return result, warnings
+
+
+def _to_view(places: Float[np.ndarray, "k 3"], T_scene_view: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "k 3"]:
+    return (places - T_scene_view[:3, 3]) @ T_scene_view[:3, :3]
+
+
+def _scan(source: ScanSource, unit: str, camera: str | Path | None) -> Scan:
+    if isinstance(source, Scan):
+        return source
+    if isinstance(source, str | Path):
+        return read_scan(source, unit, camera)
+    array = np.asarray(float_array(source, "scan", (None, 3), finite=False), dtype=np.float32)
+    real = np.isfinite(array).all(axis=1) & (array != 0).any(axis=1)
+    if not real.any():
+        raise InputError(f"none of the scan's {len(array)} points was measured: all are NaN, infinite or zero")
+    return Scan(array[real], None, None, None, check_unit(unit))
+
+
+def _object(source: PartSource, unit: str | None, name: str | None) -> ObjectModel:
+    config = ObjectConfig(num_points=_NUM_POINTS)
+    if isinstance(source, str | Path):
+        return load_object(source, unit, config)
+    unit, name = check_unit(unit or "mm"), name or "part"
+    if not isinstance(source, np.ndarray):
+        if hasattr(source, "vertices") and hasattr(source, "faces"):
+            source = (source.vertices, source.faces)
+        if not isinstance(source, tuple) or len(source) != 2:
+            raise InputError(f"a part cannot be made of a {type(source).__name__}: give a file, a cloud or a mesh")
+        vertices, triangles = (np.asarray(array) for array in source)
+        return object_from_mesh(name, vertices.astype(np.float64), triangles.astype(np.int64), unit, config)
+    cloud = np.asarray(source)
+    if cloud.ndim != 2 or cloud.shape[1] not in (3, 6):
+        raise InputError(f"the part's cloud has shape {cloud.shape}, but must be (n, 3), or (n, 6) with normals")
+    normals = cloud[:, 3:].astype(np.float64) if cloud.shape[1] == 6 else None
+    return object_from_cloud(name, cloud[:, :3].astype(np.float64), normals, unit, config)

@@ -1,0 +1,146 @@
+"""Found poses against the ones they are mistaken for, and refined on all points around them.
+
+Parts that are nearly symmetric are found the wrong way round, as few points tell. So each found pose is compared with
+its turns by quarters and halves about the part's main axes. Those that the depth image does not clearly speak against,
+once roughly refined, are refined as the pose itself is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import permutations, product
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float32, Int, Key
+
+from kmn_jax.data.crops import CropConfig, crop_around
+from kmn_jax.data.splat import Surfels
+from kmn_jax.estimator.evidence import Sight
+from kmn_jax.estimator.part import Part
+from kmn_jax.estimator.search import SceneArrays, as_visible, each, spread_rows
+from kmn_jax.estimator.select import symmetry_transforms
+from kmn_jax.estimator.verify import VerifyConfig, agreement
+from kmn_jax.geometry import compose, inverse, nearest, transform_points
+from kmn_jax.pose import IcpConfig, icp, mssd
+from kmn_jax.typing import Pose, PRNGKey, Scalar
+
+_ALIKE = 0.3  # cosine of normals, for a point that may lie on a pose's surface
+_SAME = 0.1  # diameters between points of turned and unturned parts that look the same
+_COMPARED = 256  # points
+
+
+@dataclass(frozen=True)
+class ImproveConfig:
+    """How poses are improved; lengths are shares of the object's diameter."""
+
+    alternatives: int = 2  # turned poses that are refined, too
+    margin: float = 0.15  # by which the depth image may speak against a turned pose before it is refined
+    num_points: int = 1024  # of a crop around the pose's seed
+    icp_points: int = 384  # of these, near to the pose's surface
+    object_points: int = 1024  # on the part's surface
+    reach: float = 0.1  # how near
+    icp: IcpConfig = field(default_factory=lambda: IcpConfig(iterations=30))
+    rough_turns: int = 8  # the best turns as they are, which are roughly refined
+    rough_icp: IcpConfig = field(default_factory=lambda: IcpConfig(iterations=10, distance_gate=0.2))
+    rough_points: int = 128  # of the crop
+    rough_surfels: int = 512  # by which turns are compared with the depth image
+    normal_radius: float = 0.06
+    normal_points: int = 4096
+
+
+def main_turns(part: Part) -> tuple[Float32[np.ndarray, "v 4 4"], Bool[np.ndarray, " v"]]:
+    """Return the 23 turns that map the part's main axes onto each other, about the centroid of its surface.
+
+    The flags are false for those under which the part looks the same.
+    """
+    points = part.points.astype(np.float64)
+    center = points.mean(axis=0)
+    axes = np.linalg.svd(points - center, full_matrices=False)[2]
+    turns = []
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        turn = np.zeros((3, 3))
+        turn[range(3), order] = signs
+        if np.linalg.det(turn) > 0 and not np.array_equal(turn, np.eye(3)):
+            pose = np.eye(4)
+            pose[:3, :3] = axes.T @ turn @ axes
+            pose[:3, 3] = center - pose[:3, :3] @ center
+            turns.append(pose)
+    poses = np.array(turns, dtype=np.float32)
+    symmetries = symmetry_transforms(part.symmetries)
+    some = part.points[:_COMPARED]
+    moved = np.asarray([[float(mssd(pose, np.eye(4, dtype=np.float32), some, symmetries))] for pose in poses])[:, 0]
+    return poses, moved > _SAME * part.diameter
+
+
+@partial(jax.jit, static_argnames=("config", "verify"))
+def improve(
+    poses: Float[Array, "k 4 4"],
+    real: Bool[Array, " k"],
+    seeds: Int[Array, " k"],
+    scene: SceneArrays,
+    sight: Sight,
+    surfels: Surfels,
+    turns: Float[Array, "v 4 4"],
+    is_other: Bool[Array, " v"],
+    diameter: Scalar,
+    key: PRNGKey,
+    config: ImproveConfig,
+    verify: VerifyConfig,
+) -> tuple[Float[Array, "k a 4 4"], Bool[Array, "k a"]]:
+    """Return, for poses found around seed rows of a scene, themselves and turned ones refined, and which there are."""
+    visible = as_visible(scene)
+    crops = CropConfig(
+        num_points=config.num_points,
+        max_noise=0.0,
+        normal_radius=config.normal_radius,
+        normal_points=config.normal_points,
+        min_points=1,
+    )
+    count = config.object_points
+    points, normals = surfels.points[:count], surfels.normals[:count]
+    few = Surfels(points[: config.rough_surfels], normals[: config.rough_surfels], surfels.area)
+
+    def one(pose: Pose, seed: Int[Array, ""], key: Key[Array, ""]) -> tuple[Float[Array, "a 4 4"], Bool[Array, " a"]]:
+        crop = crop_around(key, visible, seed, scene.mask[seed], jnp.zeros((1, 3)), jnp.eye(4)[None], diameter, crops)
+        shown = crop.points + crop.seed[None]
+
+        def score(pose: Pose) -> Scalar:
+            seen = agreement(pose, few, sight.depth, sight.camera, diameter, verify)
+            return seen.explained - seen.violated
+
+        def refined(pose: Pose, count: int, settings: IcpConfig) -> Pose:
+            to_object = inverse(pose)
+            row, distance = nearest(transform_points(to_object, shown), points)
+            turned = jnp.matmul(crop.normals, to_object[:3, :3].T, precision=jax.lax.Precision.HIGHEST)
+            cosine = (turned * normals[row]).sum(axis=1)
+            near = crop.mask & (distance <= config.reach * diameter) & (cosine > _ALIKE)
+            rows, there = spread_rows(near, count)
+            fine = icp(
+                points,
+                shown[rows],
+                pose,
+                diameter,
+                scene_normals=crop.normals[rows],
+                scene_mask=there,
+                config=settings,
+            )
+            return fine.T_scene_object
+
+        turned = jax.lax.map(lambda turn: compose(pose, turn), turns)
+        raw = jnp.where(is_other, jax.lax.map(score, turned), -jnp.inf)
+        hope, rows = jax.lax.top_k(raw, config.rough_turns)
+        rough = jax.lax.map(lambda start: refined(start, config.rough_points, config.rough_icp), turned[rows])
+        scores = jnp.where(jnp.isfinite(hope), jax.lax.map(score, rough), -jnp.inf)
+        best, rows = jax.lax.top_k(scores, config.alternatives)
+        there = jnp.concatenate([jnp.ones(1, dtype=bool), best >= score(pose) - config.margin])
+        starts = jnp.concatenate([pose[None], rough[rows]])
+
+        def finish(start: Pose, there: Bool[Array, ""]) -> Pose:
+            return jax.lax.cond(there, lambda: refined(start, config.icp_points, config.icp), lambda: start)
+
+        return jax.lax.map(lambda item: finish(*item), (starts, there)), there
+
+    return each(one, real, poses, seeds, jax.random.split(key, poses.shape[0]))

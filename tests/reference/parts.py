@@ -1,0 +1,42 @@
+"""A part without a network: a box, whose poses can be checked by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kmn_jax.data.symmetry import Symmetries
+from kmn_jax.estimator.part import Part
+
+HALF = np.array([1.0, 0.5, 0.5])
+
+
+def box_part(
+    count: int = 256, seed: int = 0, rotations: np.ndarray | None = None, axes: np.ndarray | None = None
+) -> Part:
+    """Return a box of 2 x 1 x 1 about the origin; it is symmetric only as far as is said."""
+    rng = np.random.default_rng(seed)
+    axis, sign = rng.integers(0, 3, count), rng.choice([-1.0, 1.0], count)
+    points = rng.uniform(-1, 1, (count, 3)) * HALF
+    points[np.arange(count), axis] = sign * HALF[axis]
+    normals = np.zeros((count, 3))
+    normals[np.arange(count), axis] = sign
+    symmetries = Symmetries(
+        np.eye(3)[None] if rotations is None else rotations,
+        np.zeros((0, 3)) if axes is None else axes,
+        np.zeros(3),
+        0.02,
+    )
+    return Part(
+        name="box",
+        unit="m",
+        points=points.astype(np.float32),
+        normals=normals.astype(np.float32),
+        features=np.zeros((8, 4), dtype=np.float32),
+        diameter=float(2 * np.linalg.norm(HALF)),
+        minimum=-HALF,
+        maximum=HALF,
+        area=10.0,
+        symmetries=symmetries,
+        source_digest="",
+        model_digest="",
+    )
