@@ -2,13 +2,171 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import traceback
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 import tyro
 
 from kmn_jax.checks import InputError
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    from kmn_jax.data.scan_files import Scan
+    from kmn_jax.estimator import Detections, Part
+
+Units = Literal["auto", "mm", "cm", "m", "in"]
+
+_VECTORS = ("--at", "--sensor", "--roi")  # flags whose values may begin with a minus sign
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to look for, and where."""
+
+    object: Path
+    """CAD file (STL, OBJ, PLY, GLB, STEP), cloud of the whole surface, or object card (.kmn)."""
+    scene: Path
+    """Cloud (PLY, PCD, XYZ, NPY, NPZ), depth image (PNG, TIFF, EXR, NPY, NPZ) or depth image of a BOP dataset."""
+    camera: Path | None = None
+    """JSON with fx, fy, cx, cy, or cam_K, and perhaps depth_scale; depth images outside of BOP datasets need it."""
+    at: tuple[str, ...] = ()
+    """X,Y,Z: search around these points of the scene only; several may be given."""
+    units: Units = "auto"
+    """Unit of the scene's lengths; auto: that of the object, or what the format says."""
+    object_units: Units = "auto"
+    """Unit of the object's lengths; auto: what the format says, else millimetres."""
+    seed: int = 0
+    """Of all that is random: the same inputs and seed give the same poses."""
+    background: Path | None = None
+    """Scan of the empty bin, of the scene's format and unit: what is near to it is no part."""
+    roi: str | None = None
+    """XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX: only points inside of this box of the scene's frame can be parts."""
+    plane: Literal["auto", "always", "never"] = "auto"
+    """Whether to leave out the largest plane and what is behind it; auto: if it is larger than the object."""
+    sensor: str | None = None
+    """X,Y,Z of the sensor in the scene's frame; the origin unless given."""
+    weights: str = "small"
+    """Released network, or a .safetensors file."""
+
+
+def prepare(
+    source: Annotated[Path, tyro.conf.Positional],
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None,
+    units: Units = "auto",
+    weights: str = "small",
+) -> None:
+    """Make an object card, so that later calls need not read and encode the CAD file.
+
+    Args:
+        source: CAD file (STL, OBJ, PLY, GLB, STEP) or cloud of the whole surface (PLY, PCD, XYZ).
+        output: the card; by default beside the source, ending in .kmn.
+        units: unit of the source's lengths; auto: what the format says, else millimetres.
+        weights: released network, or a .safetensors file.
+    """
+    from kmn_jax.estimator import PoseEstimator, save_part
+
+    target = output or source.with_suffix(".kmn")
+    part = PoseEstimator.from_pretrained(weights).prepare(source, _unit(units))
+    save_part(part, target)
+    print(f"{part.name}: {_size(part)}, {_symmetry(part)}; wrote {target}")
+
+
+def estimate(
+    request: Annotated[Request, tyro.conf.arg(name="")],
+    top: int | None = None,
+    json: Path | None = None,
+    bop_csv: Path | None = None,
+    save_picture: Path | None = None,
+) -> None:
+    """Find the copies of an object in a scan: poses of the whole bin, in pick order.
+
+    Args:
+        request: what to look for, and where.
+        top: return the first poses only.
+        json: file for the result as JSON, see docs/estimate.md.
+        bop_csv: file for the result as BOP's csv.
+        save_picture: file for a picture of scene, segmentation, keypoints and poses (PNG).
+    """
+    from kmn_jax.estimator import as_json, table, write_bop_csv, write_json
+
+    if top is not None and top < 1:
+        raise InputError(f"top is {top}, but must be at least 1")
+    for target in (json, bop_csv, save_picture):
+        if target is not None and not target.parent.is_dir():
+            raise InputError(f"cannot write {target}: its folder does not exist")
+    session = _Session(request)
+    found = session.detect(session.places)
+    if top is not None:
+        found = replace(found, poses=found.poses[:top])
+    print(table(found, session.estimator.config.accepted))
+    if json is not None:
+        facts = {"seed": request.seed, "weights": request.weights, "model": session.part.model_digest}
+        write_json(as_json(found, str(request.object), str(request.scene), facts), json)
+        print(f"wrote {json}")
+    if bop_csv is not None:
+        write_bop_csv(found, bop_csv, *session.bop_ids)
+        print(f"wrote {bop_csv}")
+    if save_picture is not None:
+        from kmn_jax.estimator.picture import save_picture as draw
+
+        draw(save_picture, session.scene.view, session.part, found, session.truth)
+        print(f"wrote {save_picture}")
+
+
+def view(
+    request: Annotated[Request, tyro.conf.arg(name="")],
+    host: str = "127.0.0.1",
+    port: int = 8080,
+) -> None:
+    """Show scan, poses and keypoints in the browser; a picked point is searched there and then.
+
+    Args:
+        request: what to look for, and where.
+        host: address to serve on; 0.0.0.0 for other machines, too.
+        port: port to serve on.
+    """
+    from kmn_jax.estimator import table
+    from kmn_jax.estimator.viewer import Viewer
+
+    session = _Session(request)
+    found = session.detect(session.places)
+    print(table(found, session.estimator.config.accepted))
+    with Viewer(
+        session.scene.view, session.part, found, host, port, on_pick=lambda point: session.detect(point[None])
+    ) as page:
+        print(f"open {page.url}; stop with Ctrl+C", flush=True)
+        page.wait()
+
+
+def export(
+    object: Path,
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    units: Units = "auto",
+    points: int = 65_536,
+    weights: str = "small",
+) -> None:
+    """Write the estimator of one part as a file that runs where JAX does, without this package.
+
+    Args:
+        object: CAD file, cloud of the whole surface, or object card (.kmn).
+        output: the artefact; docs/estimate.md tells how to call it.
+        units: unit of the object's lengths and of the scans that the artefact will be given; auto: the object's own.
+        points: how many points its scans hold at most.
+        weights: released network, or a .safetensors file.
+    """
+    from kmn_jax.estimator import PoseEstimator
+    from kmn_jax.estimator.export import export_estimator
+
+    estimator = PoseEstimator.from_pretrained(weights)
+    part = estimator.prepare(object, _unit(units))
+    size = export_estimator(estimator, part, output, points)
+    print(f"wrote {output}: {size / 1e6:.1f} MB, scans of up to {points} points in {part.unit}")
 
 
 def convert(
@@ -34,13 +192,125 @@ def convert(
     print(f"wrote {target}")
 
 
+class _Session:
+    """An estimator with the part and the scan of a request."""
+
+    def __init__(self, request: Request) -> None:
+        from kmn_jax.data.foreground import ForegroundOptions
+        from kmn_jax.estimator import PoseEstimator
+        from kmn_jax.estimator.timing import Clock
+
+        places = [_numbers(text, "--at", 3) for text in request.at]
+        region: Any = None if request.roi is None else tuple(_numbers(request.roi, "--roi", 6))
+        sensor = None if request.sensor is None else np.array(_numbers(request.sensor, "--sensor", 3))
+        self.places = np.array(places) if places else None
+        self.truth: tuple[Float[np.ndarray, "4 4"], ...] | None = None
+        self.bop_ids = (0, 0, 1)  # scene, image, object
+        self._request, self._clock = request, Clock()
+        with self._clock("part"):
+            self.estimator = PoseEstimator.from_pretrained(request.weights)
+            self.part = self.estimator.prepare(request.object, _unit(request.object_units))
+        with self._clock("scene"):
+            scan = self._read(request.scene)
+            empty = None if request.background is None else self._read(request.background)
+            background = ForegroundOptions(empty, region, request.plane)
+            self.scene = self.estimator.scene(scan, self.part, sensor=sensor, at=self.places, background=background)
+
+    def detect(self, places: Float[np.ndarray, "k 3"] | None) -> Detections:
+        """Search the scan, or places of it only."""
+        from kmn_jax.estimator.timing import Clock
+
+        clock, self._clock = self._clock, Clock()
+        return self.estimator.detect(self.part, self.scene, seed=self._request.seed, at=places, clock=clock)
+
+    def _read(self, path: Path) -> Scan:
+        from kmn_jax.data.bop_scans import bop_scan, is_bop_image
+        from kmn_jax.data.scan_files import read_scan
+        from kmn_jax.data.units import resolve_unit
+
+        request = self._request
+        if request.camera is not None or not is_bop_image(path):
+            return read_scan(path, resolve_unit(request.units, self.part.unit), request.camera)
+        scan, instances = bop_scan(path, resolve_unit(request.units, self.part.unit, "mm"))
+        if path == request.scene:
+            objects = {instance.object_id for instance in instances or ()}
+            self.bop_ids = (int(path.parent.parent.name), int(path.stem), min(objects) if len(objects) == 1 else 1)
+            if instances is not None and len(objects) == 1:  # else it is not known which of them is meant
+                self.truth = tuple(instance.T_camera_object for instance in instances)
+        return scan
+
+
+def _unit(units: Units) -> str | None:
+    return None if units == "auto" else units
+
+
+def _numbers(text: str, flag: str, count: int) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not np.isfinite(values).all():
+        raise InputError(f"{flag} is {text!r}, but must be {count} numbers with commas between them")
+    return values
+
+
+def _size(part: Part) -> str:
+    x, y, z = part.maximum - part.minimum
+    return f"{x:.4g} x {y:.4g} x {z:.4g} {part.unit}, diameter {part.diameter:.4g} {part.unit}"
+
+
+def _symmetry(part: Part) -> str:
+    found = part.symmetries
+    if len(found.axes):
+        return "turns about an axis look the same" if len(found.axes) == 1 else "looks the same from all sides"
+    return f"{len(found.rotations)} poses look the same" if part.is_symmetric else "no symmetry"
+
+
+def _joined(arguments: list[str]) -> list[str]:
+    """Return arguments in which a value that begins with a minus sign is joined to its flag."""
+    result: list[str] = []
+    for argument in arguments:
+        if result and result[-1] in _VECTORS and argument.startswith("-") and "," in argument:
+            result[-1] += f"={argument}"
+        else:
+            result.append(argument)
+    return result
+
+
+def _keep_compiled() -> None:
+    """Let JAX keep compiled programs between calls, in the user's cache unless told another place."""
+    import jax
+
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(Path(base) / "kmn_jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line: 0 is success, 2 bad input (one sentence on stderr), 1 our own failure."""
+    arguments = _joined(sys.argv[1:] if arguments is None else arguments)
+    commands: dict[str, Any] = {call.__name__: call for call in (prepare, estimate, view, export, convert)}
     try:
-        tyro.extras.subcommand_cli_from_dict({"convert": convert}, prog="kmn", args=arguments)
+        _keep_compiled()
+        tyro.extras.subcommand_cli_from_dict(commands, prog="kmn", args=arguments)
     except InputError as error:
         print(f"kmn: {error}", file=sys.stderr)
         return 2
+    except ModuleNotFoundError as error:
+        print(f"kmn: this needs the package {error.name}: pip install 'kmn_jax[all]'", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    except Exception as error:
+        if "KMN_DEBUG" in os.environ:
+            traceback.print_exc()
+        reason = str(error).splitlines()[0] if str(error) else "no message"
+        print(
+            f"kmn: failed by a fault of its own ({type(error).__name__}: {reason}); KMN_DEBUG=1 shows where",
+            file=sys.stderr,
+        )
+        return 1
     return 0
 
 

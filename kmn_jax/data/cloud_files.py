@@ -54,11 +54,12 @@ def parse_pcd(content: bytes) -> Cloud:
     named = {name: column[:, 0] for (name, _, count), column in zip(row, columns, strict=True) if count == 1}
     if not {"x", "y", "z"} <= named.keys():
         raise InputError("its points have no x, y and z")
-    points = np.stack([named[name] for name in ("x", "y", "z")], axis=1).astype(np.float64)
-    if not {"normal_x", "normal_y", "normal_z"} <= named.keys():
-        return points, None
-    normals = np.stack([named[f"normal_{name}"] for name in ("x", "y", "z")], axis=1)
-    return points, normals.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN, which is found later
+        points = np.stack([named[name] for name in ("x", "y", "z")], axis=1).astype(np.float64)
+        if not {"normal_x", "normal_y", "normal_z"} <= named.keys():
+            return points, None
+        normals = np.stack([named[f"normal_{name}"] for name in ("x", "y", "z")], axis=1)
+        return points, normals.astype(np.float64)
 
 
 def _header(content: bytes) -> tuple[dict[str, list[str]], bytes]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import logging
 import warnings
 from collections.abc import Iterator
@@ -36,7 +37,7 @@ class Mesh:
 
     vertices: Float64[np.ndarray, "v 3"]
     triangles: Int32[np.ndarray, "t 3"]
-    normals: Float64[np.ndarray, "v 3"] | None  # of a cloud whose file has them
+    normals: Float64[np.ndarray, "v 3"] | None  # of a cloud whose file has them, all of them finite
     unit: str
 
 
@@ -73,7 +74,9 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
         raise InputError(f"{path} cannot be used: {error}") from None
     except MemoryError:
         raise InputError(f"{path} cannot be used: it does not fit into memory") from None
-    return Mesh(vertices, triangles.astype(np.int32), None if len(triangles) else normals, unit)
+    if len(triangles) or (normals is not None and not np.isfinite(normals).all()):
+        normals = None
+    return Mesh(vertices, triangles.astype(np.int32), normals, unit)
 
 
 def parse_points(content: bytes, suffix: str) -> tuple[np.ndarray, np.ndarray | None]:
@@ -122,6 +125,7 @@ def _parse(content: bytes, suffix: str) -> _Parsed:
 def _parse_glb(content: bytes) -> _Parsed:
     if content[:4] != b"glTF" or int.from_bytes(content[8:12], "little") != len(content):
         raise InputError("it is truncated, or not a GLB file")
+    _check_counts(content)
     import trimesh
 
     try:
@@ -140,6 +144,17 @@ def _parse_glb(content: bytes) -> _Parsed:
     if not parts:
         return np.zeros((0, 3)), None, np.zeros((0, 3), np.int64)
     return np.concatenate(vertices), None, np.concatenate(triangles)
+
+
+def _check_counts(content: bytes) -> None:
+    """Refuse a GLB file that announces more of anything than it has bytes: the reader would make it up of zeros."""
+    try:
+        tree = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+        most = max((int(accessor["count"]) for accessor in tree.get("accessors", ())), default=0)
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+        raise InputError(f"it is damaged: its header cannot be read ({type(error).__name__})") from None
+    if most > len(content):
+        raise InputError(f"it is damaged: it announces {most} values, but has {len(content)} bytes")
 
 
 def check_triangles(vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]) -> None:

@@ -194,7 +194,8 @@ def _truncated(element: _Element) -> InputError:
 def _vectors(columns: _Columns, names: tuple[str, str, str]) -> Float64[np.ndarray, "v 3"] | None:
     parts = [columns.get(name) for name in names]
     arrays = [part for part in parts if isinstance(part, np.ndarray)]
-    return np.stack(arrays, axis=1).astype(np.float64) if len(arrays) == 3 else None
+    with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN, which is found later
+        return np.stack(arrays, axis=1).astype(np.float64) if len(arrays) == 3 else None
 
 
 def _fans(polygons: _Lists) -> Int64[np.ndarray, "t 3"]:

@@ -28,7 +28,8 @@ def parse_stl(content: bytes) -> Float64[np.ndarray, "t 3 3"]:
     """
     declared = int.from_bytes(content[80:_HEADER], "little") if len(content) >= _HEADER else None
     if declared is not None and len(content) == _HEADER + 50 * declared:  # also if its header says "solid"
-        return np.frombuffer(content, _RECORD, offset=_HEADER)["corners"].astype(np.float64)
+        with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN, which is found later
+            return np.frombuffer(content, _RECORD, offset=_HEADER)["corners"].astype(np.float64)
     if content.lstrip()[:5].lower() == b"solid":
         return _parse_text(content.replace(b"\r\n", b"\n").replace(b"\r", b"\n"))
     raise InputError(

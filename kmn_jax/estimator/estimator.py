@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from kmn_jax.checks import InputError, float_array
+from kmn_jax.data.bop_scans import bop_scan, is_bop_image
 from kmn_jax.data.cad import ObjectConfig, ObjectModel, load_object, object_from_cloud, object_from_mesh
 from kmn_jax.data.foreground import ForegroundOptions, foreground
 from kmn_jax.data.mesh_files import check_unit
@@ -86,9 +87,10 @@ class PoseEstimator:
         """Make a scan ready for searches of a part, or of several of about its size.
 
         `scan` is a file, points (n, 3) in the sensor's frame or a `Scan`; `unit` is that of its lengths, by default
-        the part's. `sensor` is where it was measured from, by default the origin, and points nearest to places `at`
-        are kept whatever is thinned out, both in the scan's frame. Raises InputError if lengths of part and scan
-        cannot belong together, or if nothing of the scan is foreground.
+        the part's. An image of a BOP dataset needs neither it nor a camera. `sensor` is where it was measured from, by
+        default the origin, and points nearest to places `at` are kept whatever is thinned out, both in the scan's
+        frame. Raises InputError if lengths of part and scan cannot belong together, or if nothing of the scan is
+        foreground.
         """
         read = _scan(scan, unit or part.unit, camera)
         problem = length_problem(part.diameter, part.unit, scene_size(read))
@@ -208,6 +210,8 @@ def _scan(source: ScanSource, unit: str, camera: str | Path | None) -> Scan:
     if isinstance(source, Scan):
         return source
     if isinstance(source, str | Path):
+        if camera is None and is_bop_image(source):
+            return bop_scan(source)[0]
         return read_scan(source, unit, camera)
     array = np.asarray(float_array(source, "scan", (None, 3), finite=False), dtype=np.float32)
     real = np.isfinite(array).all(axis=1) & (array != 0).any(axis=1)

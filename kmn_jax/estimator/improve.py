@@ -54,11 +54,13 @@ class ImproveConfig:
 def main_turns(part: Part) -> tuple[Float32[np.ndarray, "v 4 4"], Bool[np.ndarray, " v"]]:
     """Return the 23 turns that map the part's main axes onto each other, about the centroid of its surface.
 
+    These axes are those of its frame, or of its moments, whichever box along them is smaller.
     The flags are false for those under which the part looks the same.
     """
     points = part.points.astype(np.float64)
     center = points.mean(axis=0)
-    axes = np.linalg.svd(points - center, full_matrices=False)[2]
+    moments = np.linalg.svd(points - center, full_matrices=False)[2]
+    axes = min((np.eye(3), moments), key=lambda axes: float(np.prod(np.ptp(points @ axes.T, axis=0))))
     turns = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         turn = np.zeros((3, 3))

@@ -6,7 +6,7 @@ import pytest
 from benchmarks.synthetic import synthetic_matches
 from kmn_jax.checks import InputError
 from kmn_jax.geometry.se3 import pose_error
-from kmn_jax.pose import Matches, PoseStatus, RansacConfig, ransac
+from kmn_jax.pose import Matches, PoseStatus, RansacConfig, ransac, ransac_modes
 
 KEY = jax.random.key(7)
 SMALL = {"num_matches": 300, "inlier_share": 0.3}
@@ -228,3 +228,34 @@ def test_refinement_gates_shrink_as_published():
     matches, _ = small_matches()
     result = ransac(KEY, matches, RansacConfig(num_refinements=0))
     assert result.converged
+
+
+def test_modes_are_the_poses_that_a_nearly_symmetric_part_may_have():
+    matches, truth = small_matches(3)
+    half_turn = jnp.diag(jnp.array([-1.0, -1.0, 1.0, 1.0]))
+    # The same matches to the turned object: half as trusted, as they are half as many.
+    turned, share = matches.object_points @ half_turn[:3, :3], jnp.arange(300) < 150
+    both = matches._replace(
+        object_points=jnp.concatenate([matches.object_points, turned]),
+        object_normals=jnp.concatenate([matches.object_normals, matches.object_normals @ half_turn[:3, :3]]),
+        scene_points=jnp.tile(matches.scene_points, (2, 1)),
+        scene_normals=jnp.tile(matches.scene_normals, (2, 1)),
+        weights=jnp.tile(matches.weights, 2),
+        mask=jnp.concatenate([matches.mask, matches.mask & share]),
+    )
+    found = ransac_modes(KEY, both, 3)
+    assert is_recovered(found.T_scene_object[0], truth, both.object_diameter)
+    assert is_recovered(found.T_scene_object[1], truth @ half_turn, both.object_diameter)
+    assert found.num_inliers[0] > found.num_inliers[1]
+    assert bool(found.converged[:2].all())
+    for one, other in zip(ransac(KEY, both), found, strict=True):
+        np.testing.assert_array_equal(one, other[0])
+
+
+def test_modes_without_consensus_are_none():
+    matches, _ = small_matches(1)
+    found = ransac_modes(KEY, matches._replace(mask=jnp.zeros(300, dtype=bool)), 2)
+    assert not bool(found.converged.any())
+    np.testing.assert_array_equal(found.T_scene_object, np.tile(np.eye(4), (2, 1, 1)))
+    with pytest.raises(InputError, match="count is 0"):
+        ransac_modes(KEY, matches, 0)

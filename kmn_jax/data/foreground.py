@@ -1,0 +1,208 @@
+"""Which points of a scan may show parts: what is left without the empty bin, outside of a box, and a floor.
+
+The steps run in this order: box, empty bin, floor. A floor is the plane that holds most points; it is taken away with
+all that lies behind it, seen from the sensor at the origin.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64
+
+from kmn_jax.checks import InputError
+from kmn_jax.data.background import away_from_empty, in_front_of_empty
+from kmn_jax.data.mesh_files import METRES
+from kmn_jax.data.scan_files import Scan
+
+RemovePlane = Literal["auto", "always", "never"]
+Box = tuple[float, float, float, float, float, float]
+
+_TRIPLES = 1000  # of points, each of which may lie in the plane: one of a fifth of the points gets 8 of them
+_SAMPLE = 5000  # points by which planes are compared
+_REFINEMENTS = 3
+_BEHIND = 0.15  # share of the points: with more behind it, a plane is no floor, but the tops of parts, or a rim
+_LEFT = 0.01  # share of the points in front of a floor without which it may be the parts themselves
+_PLANES = 3  # one behind the other, among which a floor is looked for
+_CHUNK = 100  # planes at a time
+_HINT = ": if it is the floor, give a region of interest or the empty bin"
+
+
+@dataclass(frozen=True)
+class ForegroundOptions:
+    """What is known of the background. Lengths without a unit are shares of the object's diameter.
+
+    `remove_plane` auto takes a floor away if it is large, holds a good share of the points and has nothing much behind
+    it, and never where an empty bin is given; always takes the largest plane away, whatever it is.
+    """
+
+    background: Scan | None = None  # the empty bin, in the same frame
+    roi: Box | None = None  # xmin, ymin, zmin, xmax, ymax, zmax in the scene's frame and unit: only that is looked at
+    remove_plane: RemovePlane = "auto"
+    background_margin: float = 0.05  # nearer than that to the empty bin is background
+    plane_margin: float = 0.03  # nearer than that to the plane belongs to it
+    least_share: float = 0.2  # of the points, which a floor holds
+    least_extent: float = 1.5  # of a floor, along the longer side of what is seen of it
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.remove_plane not in get_args(RemovePlane):
+            raise InputError(f"remove_plane is {self.remove_plane!r}, but must be auto, always or never")
+        if self.roi is not None:
+            low, high = self.roi[:3], self.roi[3:]
+            if not np.isfinite(self.roi).all() or not all(a < b for a, b in zip(low, high, strict=True)):
+                raise InputError(
+                    f"roi is {self.roi}, but must be xmin ymin zmin xmax ymax zmax, each min below its max"
+                )
+        for name in ("background_margin", "plane_margin", "least_extent"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"{name} is {getattr(self, name)}, but must be above zero and finite")
+        if not 0 < self.least_share < 1:
+            raise InputError(f"least_share is {self.least_share}, but must be between 0 and 1")
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Points x with normal · x = offset. The unit normal points away from the sensor at the origin: behind is above."""
+
+    normal: Float64[np.ndarray, "3"]
+    offset: float  # its distance from the sensor
+
+    def height(self, points: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
+        """Return how far points are behind the plane, below zero in front of it."""
+        return points.astype(np.float64) @ self.normal - self.offset
+
+
+def foreground(
+    scan: Scan, diameter: float, options: ForegroundOptions | None = None
+) -> tuple[Bool[np.ndarray, " n"], tuple[str, ...]]:
+    """Return which points of a scan may show an object of that diameter, and what the user should know of it.
+
+    The same scan and options give the same mask. Raises InputError if nothing is left, naming the step that took the
+    last points away.
+    """
+    options = options or ForegroundOptions()
+    if not 0 < diameter < math.inf:
+        raise InputError(f"diameter is {diameter}, but must be above zero and finite")
+    kept: Bool[np.ndarray, " n"] = np.ones(len(scan.points), dtype=bool)
+    warnings: list[str] = []
+    if options.roi is not None:
+        low, high = np.array(options.roi[:3]), np.array(options.roi[3:])
+        kept &= ((scan.points >= low) & (scan.points <= high)).all(axis=1)
+        if not kept.any():
+            raise InputError(f"the region of interest holds none of the {len(kept)} points: {_box_of(scan)}")
+    if options.background is not None:
+        before = int(kept.sum())
+        kept &= _off_background(scan, options.background, diameter, options.background_margin)
+        if not kept.any():
+            raise InputError(f"all {before} points are those of the empty bin, or too near to it: is it really empty?")
+    wanted = options.remove_plane == "always" or (options.remove_plane == "auto" and options.background is None)
+    if wanted:
+        chosen = np.flatnonzero(kept)
+        floor, warning = _floor(scan.points[chosen], diameter, options)
+        if floor is not None:
+            kept[chosen] = floor.height(scan.points[chosen]) < -options.plane_margin * diameter
+            if not kept.any():
+                raise InputError(
+                    f"all {len(chosen)} points lie in one plane or behind it: if they show parts, keep the plane"
+                )
+        warnings += [warning] if warning else []
+    return kept, tuple(warnings)
+
+
+def _box_of(scan: Scan) -> str:
+    low, high = scan.points.min(axis=0), scan.points.max(axis=0)
+    ranges = (f"{axis} from {a:g} to {b:g}" for axis, a, b in zip("xyz", low, high, strict=True))
+    return f"the scan has {', '.join(ranges)} {scan.unit}"
+
+
+def _off_background(scan: Scan, empty: Scan, diameter: float, margin: float) -> Bool[np.ndarray, " n"]:
+    if METRES[empty.unit] != METRES[scan.unit]:
+        empty = empty.in_unit(scan.unit)
+    if scan.depth is not None and empty.depth is not None and scan.camera == empty.camera:
+        return np.asarray(in_front_of_empty(scan.depth, empty.depth, diameter, margin))[scan.depth > 0]
+    return away_from_empty(scan.points, empty.points, diameter, margin)
+
+
+def _floor(
+    points: Float32[np.ndarray, "n 3"], diameter: float, options: ForegroundOptions
+) -> tuple[Plane | None, str | None]:
+    """Return the plane to take away, or none, and what may make a user wonder.
+
+    The largest plane may be the tops of a layer of parts. Then the floor is the largest plane behind it.
+    """
+    margin = options.plane_margin * diameter
+    searched, kept_plane = points, None
+    for _ in range(_PLANES):
+        plane = dominant_plane(searched, margin, options.seed)
+        if plane is None:
+            break
+        height = plane.height(points)
+        within = np.abs(height) <= margin
+        share, behind, before = (float(part.mean()) for part in (within, height > margin, height < -margin))
+        if options.remove_plane == "always":
+            weak = f"the largest plane was taken away as asked, though it holds only {share:.0%} of the points"
+            return plane, weak if share < options.least_share else None
+        if share < options.least_share or _extent(points[within]) <= options.least_extent * diameter:
+            break
+        if behind <= _BEHIND and before < _LEFT:
+            return None, (
+                f"a plane with {share:.0%} of the points was kept, as only {before:.1%} lie in front of it: if it is"
+                " the floor, have it always removed"
+            )
+        if behind <= _BEHIND:
+            return plane, kept_plane and f"{kept_plane} was kept, in front of the one that was taken away{_HINT}"
+        kept_plane = kept_plane or (f"a plane with {share:.0%} of the points" if share > behind else None)
+        searched = points[height > margin]
+    if options.remove_plane == "always":
+        return None, "no plane was taken away, as none was found"
+    return None, kept_plane and f"{kept_plane} was kept, as many lie behind it{_HINT}"
+
+
+def dominant_plane(points: Float[np.ndarray, "n 3"], margin: float, seed: int = 0) -> Plane | None:
+    """Return the plane with the most points nearer to it than `margin`, refined by all of those; None if there is none.
+
+    Planes through three random points are compared, so that the same seed gives the same plane.
+    """
+    generator = np.random.default_rng(seed)
+    if len(points) < 3:
+        return None
+    center = points.astype(np.float64).mean(axis=0)
+    everything = points.astype(np.float64) - center
+    sample = everything if len(points) <= _SAMPLE else everything[generator.integers(0, len(points), _SAMPLE)]
+    corners = sample[generator.integers(0, len(sample), (_TRIPLES, 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    proper = length > 0
+    if not proper.any():
+        return None
+    normals, corner = normals[proper] / length[proper, None], corners[proper, 0]
+    offsets = (normals * corner).sum(axis=1)
+    counts = np.concatenate(
+        [
+            (np.abs(sample @ normals[start : start + _CHUNK].T - offsets[start : start + _CHUNK]) <= margin).sum(axis=0)
+            for start in range(0, len(normals), _CHUNK)
+        ]
+    )
+    best = int(counts.argmax())
+    normal, offset = normals[best], float(offsets[best])
+    for _ in range(_REFINEMENTS):
+        inner = everything[np.abs(everything @ normal - offset) <= margin]
+        if len(inner) < 3:
+            break
+        middle = inner.mean(axis=0)
+        _, axes = np.linalg.eigh((inner - middle).T @ (inner - middle))
+        normal, offset = axes[:, 0], float(axes[:, 0] @ middle)
+    offset += float(normal @ center)
+    return Plane(normal, offset) if offset >= 0 else Plane(-normal, -offset)
+
+
+def _extent(points: Float[np.ndarray, "n 3"]) -> float:
+    """Return the longer side of what is seen of a plane, without the outermost percent of its points."""
+    offsets = points.astype(np.float64) - points.astype(np.float64).mean(axis=0)
+    axis = np.linalg.eigh(offsets.T @ offsets)[1][:, 2]
+    low, high = np.percentile(offsets @ axis, (1, 99))
+    return float(high - low)

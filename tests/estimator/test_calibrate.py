@@ -1,0 +1,66 @@
+"""Probabilities: what is fitted is found again, files come back, and what cannot be used is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kmn_jax.checks import InputError
+from kmn_jax.estimator.calibrate import (
+    Calibration,
+    calibration_bytes,
+    expected_calibration_error,
+    fit_calibration,
+    load_calibration,
+    reliability,
+)
+
+NAMES = ("first", "second", "constant")
+
+
+def drawn(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return evidence, and outcomes of a known logistic model of it."""
+    rng = np.random.default_rng(0)
+    evidence = np.concatenate([rng.normal(size=(count, 2)) * [1, 5] + [0, 3], np.ones((count, 1))], axis=1)
+    probability = 1 / (1 + np.exp(-(2 * evidence[:, 0] - 0.3 * evidence[:, 1] + 1)))
+    return evidence.astype(np.float32), rng.random(count) < probability
+
+
+def test_a_known_model_is_found_and_its_probabilities_hold() -> None:
+    evidence, right = drawn(20_000)
+    fitted = fit_calibration(evidence, right, NAMES)
+    np.testing.assert_allclose(fitted.weights[:2], [2, -0.3], rtol=0.1)
+    np.testing.assert_allclose(fitted.bias + fitted.weights[2], 1, atol=0.15)
+    assert expected_calibration_error(fitted.probability(evidence), right) < 0.02
+    assert expected_calibration_error(np.full(len(right), 0.99), right) > 0.2
+
+
+def test_evidence_that_decides_completely_keeps_finite_weights() -> None:
+    evidence = np.array([[0.0], [0.1], [0.9], [1.0]], dtype=np.float32)
+    fitted = fit_calibration(evidence, np.array([False, False, True, True]), ("only",))
+    assert np.isfinite(fitted.weights).all()
+    assert (fitted.probability(evidence) > 0.5).tolist() == [False, False, True, True]
+    with pytest.raises(InputError, match="4 of 4 poses are right"):
+        fit_calibration(evidence, np.ones(4, dtype=bool), ("only",))
+
+
+def test_reliability_counts_every_pose_once() -> None:
+    probability = np.array([0.0, 0.05, 0.55, 1.0])
+    rows = reliability(probability, np.array([False, False, True, True]))
+    assert [count for _, _, count in rows] == [2, 1, 1]
+    np.testing.assert_allclose([mean for mean, _, _ in rows], [0.025, 0.55, 1.0])
+
+
+def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.calibration.json"
+    fitted = Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25)
+    path.write_bytes(calibration_bytes(fitted))
+    assert load_calibration(path, NAMES) == fitted
+    with pytest.raises(InputError, match="of other evidence"):
+        load_calibration(path, ("first",))
+    for content in ("", "[]", '{"names": ["first"], "weights": ["x"], "bias": 0}'):
+        path.write_text(content)
+        with pytest.raises(InputError, match="not a readable calibration"):
+            load_calibration(path, ("first",))

@@ -1,0 +1,94 @@
+"""Poses found the wrong way round are turned to what the depth image shows, and refined."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kmn_jax.data.cad import ObjectConfig, object_from_mesh
+from kmn_jax.data.raycast import RayMesh, render
+from kmn_jax.data.scan_files import Scan
+from kmn_jax.data.scene import Camera, measured_points
+from kmn_jax.data.splat import Surfels, intrinsics
+from kmn_jax.data.symmetry import rotation_about
+from kmn_jax.estimator.evidence import Sight
+from kmn_jax.estimator.improve import ImproveConfig, improve, main_turns
+from kmn_jax.estimator.part import Part
+from kmn_jax.estimator.scene import Scene, make_scene
+from kmn_jax.estimator.verify import VerifyConfig
+from kmn_jax.estimator.view import view_of
+from kmn_jax.pose import mssd
+from tests.reference.meshes import bracket, camera_scene, pose, random_rotations
+from tests.reference.parts import box_part
+
+CAMERA = Camera(500.0, 500.0, 159.5, 119.5, 320, 240)
+TRUE = pose((0.05, -0.02, 3.0), random_rotations(1, 5)[0])
+
+
+@pytest.fixture(scope="module")
+def part() -> Part:
+    found = object_from_mesh("bracket", *bracket(), "m", ObjectConfig(num_points=2048))
+    return Part(
+        "bracket",
+        "m",
+        found.points.astype(np.float32),
+        found.normals.astype(np.float32),
+        np.zeros((8, 4), np.float32),
+        found.diameter,
+        found.minimum,
+        found.maximum,
+        found.area,
+        found.symmetries,
+        "",
+        "",
+    )
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    depth = render(RayMesh(*bracket()), camera_scene([TRUE], CAMERA), include_bin=False).depth.astype(np.float32)
+    view = view_of(Scan(measured_points(depth, CAMERA), None, depth, CAMERA, "m"))
+    return make_scene(view, "m", np.ones(len(view.points), dtype=bool), 131_072)
+
+
+def test_turns_are_rotations_about_the_centroid_but_for_symmetries(part: Part) -> None:
+    turns, is_other = main_turns(part)
+    assert turns.shape == (23, 4, 4)
+    np.testing.assert_allclose(np.linalg.det(turns[:, :3, :3]), 1, atol=1e-5)
+    center = np.append(part.points.mean(axis=0), 1)
+    np.testing.assert_allclose(turns @ center, np.tile(center, (23, 1)), atol=1e-5)
+    assert is_other.sum() >= 22
+    halves = np.stack([np.eye(3), *(rotation_about(axis, np.pi) for axis in np.eye(3))])
+    _, is_other = main_turns(box_part(2000, rotations=halves))
+    assert 23 - is_other.sum() >= 3
+
+
+def test_turned_poses_come_back(part: Part, scene: Scene) -> None:
+    turns, is_other = main_turns(part)
+    shift = np.eye(4, dtype=np.float32)
+    shift[:3, 3] = 0.03
+    starts = np.stack([TRUE @ shift, *(TRUE @ turn @ shift for turn in turns[::6])]).astype(np.float32)
+    seeds = jnp.full(len(starts), len(scene.points) // 2, dtype=jnp.int32)
+    surfels = Surfels(jnp.asarray(part.points), jnp.asarray(part.normals), jnp.float32(part.area))
+    found, there = improve(
+        jnp.asarray(starts),
+        jnp.arange(len(starts)) < len(starts) - 1,
+        seeds,
+        scene.arrays,
+        Sight(scene.depth, intrinsics(CAMERA)),
+        surfels,
+        jnp.asarray(turns),
+        jnp.asarray(is_other),
+        jnp.float32(part.diameter),
+        jax.random.key(0),
+        ImproveConfig(margin=2.0),
+        VerifyConfig(),
+    )
+    errors = np.array([[float(mssd(T, TRUE.astype(np.float32), part.points[:300])) for T in row] for row in found])
+    assert errors[0, 0] < 0.02 * part.diameter  # the right one stays, refined
+    best = np.where(there, errors, np.inf).min(axis=1)
+    assert (best[:-1] < 0.05 * part.diameter).mean() >= 0.75
+    assert not bool(there[-1].any())  # what is not real is skipped
+    assert bool(jnp.isfinite(found).all())

@@ -1,0 +1,132 @@
+"""`kmn prepare` and `kmn estimate` as a user calls them: files in, files out, one sentence for bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kmn_jax.cli import main
+from kmn_jax.data.bop_results import read_results
+from kmn_jax.data.bop_scans import bop_scan
+
+ASSETS = Path(__file__).parent.parent / "experiments" / "assets"
+IMAGE = sorted((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))[0]
+MOTOR = ASSETS / "industrial" / "gear_motor.stl"
+
+
+@pytest.fixture(scope="module")
+def card(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("card") / "motor.kmn"
+    assert main(["prepare", str(MOTOR), "-o", str(path)]) == 0
+    assert path.stat().st_size < 1_000_000
+    return path
+
+
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("cloud") / "scan.npy"
+    np.save(path, bop_scan(IMAGE)[0].points)
+    return path
+
+
+def test_a_bin_in_all_forms_of_output(card: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    outputs = {flag: tmp_path / name for flag, name in (("--json", "a.json"), ("--bop-csv", "a.csv"))}
+    picture = tmp_path / "a.png"
+    arguments = [str(part) for pair in outputs.items() for part in pair]
+    code = main(
+        [
+            "estimate",
+            "--object",
+            str(card),
+            "--scene",
+            str(IMAGE),
+            *arguments,
+            "--save-picture",
+            str(picture),
+            "--top",
+            "3",
+        ]
+    )
+    said = capsys.readouterr()
+    assert code == 0, said.err
+    assert "probability" in said.out
+    found = json.loads(outputs["--json"].read_text())
+    assert found["version"] == 1
+    assert found["unit"] == "mm"
+    assert 1 <= len(found["poses"]) <= 3
+    assert {"T_scene_object", "probability", "inliers", "visible_fraction", "runner_up_gap", "warnings"} <= found[
+        "poses"
+    ][0].keys()
+    rows = read_results(outputs["--bop-csv"], "mm")
+    assert [row.score for row in rows] == [pose["probability"] for pose in found["poses"]]
+    assert (rows[0].scene_id, rows[0].image_id, rows[0].object_id) == (2, int(IMAGE.stem), 2)
+    np.testing.assert_allclose(rows[0].T_camera_object, found["poses"][0]["T_scene_object"], atol=1e-6)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_cloud_around_a_point(card: Path, cloud: Path, tmp_path: Path) -> None:
+    target = tmp_path / "b.json"
+    place = ",".join(f"{x:.3f}" for x in np.load(cloud)[100])
+    assert main(["estimate", "--object", str(card), "--scene", str(cloud), "--at", place, "--json", str(target)]) == 0
+    assert json.loads(target.read_text())["seed"] == 0
+
+
+def test_bad_input_is_one_sentence_and_exit_2(
+    card: Path, cloud: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "empty.ply").write_bytes(b"")
+    (tmp_path / "short.kmn").write_bytes(card.read_bytes()[:5000])
+    (tmp_path / "renamed.ply").write_bytes(MOTOR.read_bytes())
+    (tmp_path / "nothing.stl").write_text("solid a\nendsolid a\n")
+    (tmp_path / "camera.json").write_text("{")
+    np.save(tmp_path / "nan.npy", np.full((10, 3), np.nan, np.float32))
+    np.save(tmp_path / "metres.npy", np.load(cloud) / 1000)
+    np.save(tmp_path / "depth.npy", np.ones((40, 50), np.float32))
+    whole = {"--object": str(card), "--scene": str(cloud)}
+    cases: list[tuple[dict[str, str], str]] = [
+        ({"--scene": "none.ply"}, "none.ply"),
+        ({"--scene": str(tmp_path / "empty.ply")}, "empty.ply"),
+        ({"--scene": str(tmp_path / "renamed.ply")}, "renamed.ply"),
+        ({"--scene": str(tmp_path / "nan.npy")}, "none of its 10 points was measured"),
+        ({"--scene": str(tmp_path / "metres.npy")}, "--units m"),
+        ({"--scene": str(tmp_path / "depth.npy")}, "camera"),
+        ({"--scene": str(tmp_path / "depth.npy"), "--camera": str(tmp_path / "camera.json")}, "camera.json"),
+        ({"--object": str(tmp_path / "short.kmn")}, "short.kmn"),
+        ({"--object": str(tmp_path / "nothing.stl")}, "nothing.stl"),
+        ({"--at": "1,2"}, "--at"),
+        ({"--roi": "1,2,3,0,0,0"}, "roi"),
+        ({"--top": "0"}, "top"),
+        ({"--json": str(tmp_path / "missing" / "a.json")}, "folder does not exist"),
+        ({"--weights": "large"}, "no released model"),
+    ]
+    for changes, message in cases:
+        arguments = [part for pair in (whole | changes).items() for part in pair]
+        assert main(["estimate", *arguments]) == 2, changes
+        error = capsys.readouterr().err
+        assert error.startswith("kmn: ")
+        assert message in error, error
+        assert error.count("\n") == 1, error
+    assert main(["prepare", str(tmp_path / "nothing.stl")]) == 2
+
+
+def test_a_killed_command_leaves_no_half_written_file(tmp_path: Path) -> None:
+    target = tmp_path / "motor.kmn"
+    for delay in (0.5, 3.0, 6.0):
+        command = [sys.executable, "-m", "kmn_jax.cli", "prepare", str(MOTOR), "-o", str(target)]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(delay)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        visible = [path for path in tmp_path.iterdir() if not path.name.startswith(".")]
+        assert visible in ([], [target])
+        if visible:
+            assert main(["estimate", "--object", str(target), "--scene", os.devnull]) == 2  # readable: the scene is not
+            target.unlink()
