@@ -22,9 +22,11 @@ from experiments.fpfh import SOLVERS
 from experiments.test_sets import SPLIT
 from kmn_jax.checks import InputError
 from kmn_jax.estimator.calibrate import (
-    calibration_bytes,
+    Calibration,
+    Probabilities,
     expected_calibration_error,
     fit_calibration,
+    probabilities_bytes,
     reliability,
 )
 from kmn_jax.estimator.candidates import (
@@ -34,7 +36,6 @@ from kmn_jax.estimator.candidates import (
     Solver,
     find_candidates,
     improved,
-    join,
     seeds_over,
 )
 from kmn_jax.estimator.evidence import EVIDENCE
@@ -64,10 +65,10 @@ class Options:
 
 
 def collect(options: Options) -> dict[str, np.ndarray]:
-    """Return evidence, outcome and object of all candidates."""
+    """Return evidence, outcome and object of all poses, and whether they are refined."""
     model = load_pretrained() if options.model is None else load_model(options.model)
     config = CandidateConfig()
-    columns: dict[str, list[np.ndarray]] = {"evidence": [], "right": [], "object": [], "error": []}
+    columns: dict[str, list[np.ndarray]] = {"evidence": [], "error": [], "object": [], "refined": []}
     folders = sorted(path for path in options.bins.glob("*") if (path / SPLIT).is_dir())
     if not folders:
         raise InputError(f"{options.bins} holds no datasets: python -m experiments.build_data validation-bins")
@@ -77,29 +78,51 @@ def collect(options: Options) -> dict[str, np.ndarray]:
             seeds = seeds_over(image.scene, image.scene.foreground, image.part, config)
             parts = [image.part] if row % STRANGERS or image.stranger is None else [image.part, image.stranger]
             for part in parts:
-                found = _candidates(model, part, image.scene, seeds, config, SOLVERS[options.method])
-                error = image.errors(found.T_view_object[found.usable]).min(axis=1, initial=np.inf)
-                if part is not image.part:
-                    error = np.full_like(error, np.inf)
-                columns["evidence"].append(found.evidence[found.usable])
-                columns["error"].append(error)
-                columns["right"].append(error < THRESHOLD)
-                columns["object"].append(np.full(len(error), 1000 * number + image.key.scene_id))
+                stages = _found_and_refined(model, part, image.scene, seeds, config, SOLVERS[options.method])
+                for refined, found in enumerate(stages):
+                    error = image.errors(found.T_view_object[found.usable]).min(axis=1, initial=np.inf)
+                    columns["evidence"].append(found.evidence[found.usable])
+                    columns["error"].append(error if part is image.part else np.full_like(error, np.inf))
+                    columns["object"].append(np.full(len(error), 1000 * number + image.key.scene_id))
+                    columns["refined"].append(np.full(len(error), bool(refined)))
     return {name: np.concatenate(parts) for name, parts in columns.items()}
 
 
-def _candidates(
+def _found_and_refined(
     model: Model, part: Part, scene: Scene, seeds: Seeds, config: CandidateConfig, solver: Solver | None
-) -> Candidates:
-    """Return the poses around seeds, and the improved forms of those that the depth image speaks for."""
+) -> list[Candidates]:
+    """Return the poses around seeds, and the refined forms of those that the depth image speaks for."""
     found = find_candidates(model, part, scene, seeds, 0, config, solver)
     explained, violated = (found.evidence[:, EVIDENCE.index(name)] for name in ("explained", "violated"))
     score = np.maximum(explained - violated, 0).astype(np.float64)
     chosen = select(found.T_view_object, score, found.usable & (score > 0), part, SelectConfig())
     rows = np.flatnonzero(chosen.kept)
-    if not len(rows):
-        return found
-    return join([found, improved(model, part, scene, found, rows, 0, config)])
+    return [found, improved(model, part, scene, found, rows, 0, config)] if len(rows) else [found]
+
+
+def fit(evidence: np.ndarray, right: np.ndarray, objects: np.ndarray, folds: int) -> tuple[Calibration, dict[str, Any]]:
+    """Return the model of all poses, and how well models predict the objects that they were not fitted to."""
+    held_out = np.zeros(len(right))
+    names = np.unique(objects)
+    for fold in range(folds):
+        own = np.isin(objects, names[fold::folds])
+        held_out[own] = fit_calibration(evidence[~own], right[~own], EVIDENCE).probability(evidence[own])
+    model = fit_calibration(evidence, right, EVIDENCE)
+    accepted = held_out >= 0.5
+    summary = {
+        "objects": len(names),
+        "poses": len(right),
+        "right": float(right.mean()),
+        "expected calibration error": expected_calibration_error(held_out, right),
+        "right among accepted": float(right[accepted].mean()) if accepted.any() else None,
+        "accepted among right": float(accepted[right].mean()),
+    }
+    table = [
+        {"probability": mean, "share right": share, "poses": count}
+        for mean, share, count in reliability(held_out, right)
+    ]
+    weights = dict(zip(EVIDENCE, model.weights, strict=True)) | {"bias": model.bias}
+    return model, {"summary": summary, "reliability": table, "weights": weights}
 
 
 def calibrate(options: Options) -> dict[str, Any]:
@@ -107,36 +130,19 @@ def calibrate(options: Options) -> dict[str, Any]:
     check_target(options.json)
     if options.candidates is not None and options.candidates.exists():
         with np.load(options.candidates) as stored:
-            found = dict(stored)
+            poses = dict(stored)
     else:
-        found = collect(options)
+        poses = collect(options)
         if options.candidates is not None:
-            np.savez(options.candidates, allow_pickle=False, **found)
-    evidence, right, objects = found["evidence"], found["right"].astype(bool), found["object"]
-    held_out = np.zeros(len(right))
-    names = np.unique(objects)
-    for fold in range(options.folds):
-        own = np.isin(objects, names[fold :: options.folds])
-        held_out[own] = fit_calibration(evidence[~own], right[~own], EVIDENCE).probability(evidence[own])
-    calibration = fit_calibration(evidence, right, EVIDENCE)
-    write_whole(options.output, calibration_bytes(calibration))
-    accepted = held_out >= 0.5
-    table = [
-        {"probability": mean, "share right": share, "candidates": count}
-        for mean, share, count in reliability(held_out, right)
-    ]
-    summary = {
-        "objects": len(names),
-        "candidates": len(right),
-        "right": float(right.mean()),
-        "expected calibration error": expected_calibration_error(held_out, right),
-        "right among accepted": float(right[accepted].mean()) if accepted.any() else None,
-        "accepted among right": float(accepted[right].mean()),
-    }
-    weights = dict(zip(EVIDENCE, calibration.weights, strict=True)) | {"bias": calibration.bias}
-    print_table("Reliability, of objects that were not fitted to", table)
-    print_table("Summary", [summary])
-    results = {"summary": summary, "reliability": table, "weights": weights}
+            np.savez(options.candidates, allow_pickle=False, **poses)
+    models, results = [], {}
+    for name, own in (("found", ~poses["refined"]), ("refined", poses["refined"])):
+        right = poses["error"][own] < THRESHOLD
+        model, results[name] = fit(poses["evidence"][own], right, poses["object"][own], options.folds)
+        models.append(model)
+        print_table(f"Reliability of poses as {name}, of objects that were not fitted to", results[name]["reliability"])
+        print_table(f"Poses as {name}", [results[name]["summary"]])
+    write_whole(options.output, probabilities_bytes(Probabilities(*models)))
     write_json(options.json, results)
     return results
 

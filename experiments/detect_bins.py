@@ -23,7 +23,7 @@ from experiments.calibrate import SHIPPED
 from experiments.fpfh import SOLVERS
 from experiments.test_sets import SPLIT
 from kmn_jax.checks import InputError
-from kmn_jax.estimator.calibrate import Calibration, expected_calibration_error, load_calibration, reliability
+from kmn_jax.estimator.calibrate import Probabilities, expected_calibration_error, load_probabilities, reliability
 from kmn_jax.estimator.detect import DetectConfig, detect
 from kmn_jax.estimator.evidence import EVIDENCE
 from kmn_jax.estimator.result import Detections
@@ -99,8 +99,8 @@ def run(options: Options) -> dict[str, Any]:
         raise InputError(f"method {unknown[0]!r} is not known: choose among {', '.join(SOLVERS)}")
     model = load_pretrained() if options.model is None else load_model(options.model)
     config = DetectConfig()
-    fitted: dict[str, Calibration] = {
-        name: load_calibration(options.calibration if name == "kmn_jax" else options.fpfh_calibration, EVIDENCE)
+    fitted: dict[str, Probabilities] = {
+        name: load_probabilities(options.calibration if name == "kmn_jax" else options.fpfh_calibration, EVIDENCE)
         for name in options.methods
     }
     tallies: dict[tuple[str, str], Tally] = defaultdict(Tally)

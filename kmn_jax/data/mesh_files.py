@@ -143,6 +143,8 @@ def _parse_glb(content: bytes) -> _Parsed:
         raise InputError(f"it is damaged ({type(error).__name__}: {reason})") from None
     if not parts:
         return np.zeros((0, 3)), None, np.zeros((0, 3), np.int64)
+    if any(array.shape[1:] != (3,) for array in (*vertices, *triangles)):
+        raise InputError("it is damaged: its positions or triangles are not three numbers each")
     return np.concatenate(vertices), None, np.concatenate(triangles)
 
 

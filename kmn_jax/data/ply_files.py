@@ -14,6 +14,7 @@ _KINDS = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4
 _KINDS |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
 _KINDS |= {"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"}
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+_MAX_INDEX = 1e15  # of a vertex: what is beyond does not fit an integer
 _MAX_HEADER = 100_000  # bytes: what has no end by then is not a header
 
 
@@ -201,7 +202,8 @@ def _vectors(columns: _Columns, names: tuple[str, str, str]) -> Float64[np.ndarr
 def _fans(polygons: _Lists) -> Int64[np.ndarray, "t 3"]:
     """Cut polygons into triangles around their first corners."""
     counts, values = polygons
-    if len(values) and not (np.isfinite(values).all() and (values == np.rint(values)).all()):
+    whole = np.isfinite(values) & (np.abs(values) < _MAX_INDEX) & (values == np.rint(values))
+    if not whole.all():
         raise InputError("it is damaged: a face names a vertex by something that is not a whole number")
     number = np.maximum(counts - 2, 0)
     first = np.repeat(np.cumsum(counts) - counts, number)

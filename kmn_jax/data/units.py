@@ -110,7 +110,7 @@ def length_problem(diameter: float, object_unit: str, scene: SceneSize) -> str |
     change = f"{factor:.4g} times larger" if factor > 1 else f"{1 / factor:.4g} times smaller"
     other = [f"{_NAMES[name]} for the {what}" for odd, what, name, _ in sorted(candidates)[1:] if odd < least + _CLOSE]
     too = f" ({', '.join(other)} would fit, too)" if other else ""
-    say = f"say --units {unit}" if which == "scene" else f"give the object's unit as {unit}"
+    say = f"say --{'units' if which == 'scene' else 'object-units'} {unit}"
     return f"{fault}: the {which} would fit {change}, so its lengths are probably {_NAMES[unit]}{too}: {say}"
 
 

@@ -74,23 +74,34 @@ def reliability(
     return [(float(probability[own].mean()), float(right[own].mean()), int(own.sum())) for own in chosen if own.any()]
 
 
-def calibration_bytes(calibration: Calibration) -> bytes:
-    """Return the JSON form of a calibration."""
-    return (json.dumps(asdict(calibration), indent=1) + "\n").encode()
+@dataclass(frozen=True)
+class Probabilities:
+    """The model of poses as they are found, which chooses among them, and that of refined ones, which is reported."""
+
+    found: Calibration
+    refined: Calibration
 
 
-def load_calibration(path: str | Path, names: Sequence[str]) -> Calibration:
-    """Read a calibration of the evidence with the given names. Raises InputError if the file holds anything else."""
+def probabilities_bytes(probabilities: Probabilities) -> bytes:
+    """Return the JSON form."""
+    return (json.dumps(asdict(probabilities), indent=1) + "\n").encode()
+
+
+def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
+    """Read models of the evidence with the given names. Raises InputError if the file holds anything else."""
     try:
-        found = json.loads(Path(path).read_text(encoding="utf-8"))
-        calibration = Calibration(
-            tuple(str(name) for name in found["names"]),
-            tuple(float(weight) for weight in found["weights"]),
-            float(found["bias"]),
-        )
-        finite = np.isfinite([*calibration.weights, calibration.bias]).all()
+        stored = json.loads(Path(path).read_text(encoding="utf-8"))
+        models = [
+            Calibration(
+                tuple(str(name) for name in found["names"]),
+                tuple(float(weight) for weight in found["weights"]),
+                float(found["bias"]),
+            )
+            for found in (stored["found"], stored["refined"])
+        ]
+        finite = all(np.isfinite([*model.weights, model.bias]).all() for model in models)
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is not a readable calibration: {error}") from None
-    if calibration.names != tuple(names) or len(calibration.weights) != len(names) or not finite:
+    if any(model.names != tuple(names) or len(model.weights) != len(names) for model in models) or not finite:
         raise InputError(f"{path} is a calibration of other evidence: fit it again with experiments.calibrate")
-    return calibration
+    return Probabilities(*models)

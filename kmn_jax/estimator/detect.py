@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float32
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.symmetry import Symmetries
-from kmn_jax.estimator.calibrate import Calibration
+from kmn_jax.estimator.calibrate import Calibration, Probabilities
 from kmn_jax.estimator.candidates import (
     CandidateConfig,
     Candidates,
@@ -56,7 +56,7 @@ class DetectConfig:
 
 def detect(
     model: Model,
-    calibration: Calibration,
+    probabilities: Probabilities,
     part: Part,
     scene: Scene,
     seed: int,
@@ -81,7 +81,7 @@ def detect(
         if at is not None or len(rounds) == config.rounds:
             break
         with clock("coverage"):
-            probability = calibration.probability(joined.evidence)
+            probability = probabilities.found.probability(joined.evidence)
             accepted = joined.T_view_object[joined.usable & (probability >= config.accepted)]
             near = config.candidates.seed_spacing / 2 * part.diameter
             free = scene.foreground & ~_near_places(scene.points, np.asarray(joined.searched.crops.seed), near)
@@ -90,15 +90,15 @@ def detect(
         if not free.any():
             break
     with clock("selection"):
-        choice = _selected(joined, calibration, part, config)
+        choice = _selected(joined, probabilities.found, part, config)
     if choice.kept.any():
         with clock("refinement"):
             rows = np.flatnonzero(choice.kept | choice.contenders)
             joined = improved(model, part, scene, joined, rows, seed, config.candidates)
         with clock("selection"):
-            choice = _selected(joined, calibration, part, config)
+            choice = _selected(joined, probabilities.refined, part, config)
     with clock("report"):
-        probability = calibration.probability(joined.evidence)
+        probability = probabilities.refined.probability(joined.evidence)
         found = [
             _detection(row, float(probability[row]), float(choice.gap[row]), joined, part, scene)
             for row in np.flatnonzero(choice.kept).tolist()

@@ -17,7 +17,7 @@ from kmn_jax.data.foreground import ForegroundOptions, foreground
 from kmn_jax.data.mesh_files import check_unit
 from kmn_jax.data.scan_files import Scan, read_scan
 from kmn_jax.data.units import length_problem, scene_size
-from kmn_jax.estimator.calibrate import Calibration, load_calibration
+from kmn_jax.estimator.calibrate import Probabilities, load_probabilities
 from kmn_jax.estimator.detect import DetectConfig, detect
 from kmn_jax.estimator.evidence import EVIDENCE
 from kmn_jax.estimator.part import Part, load_part, make_part, model_digest
@@ -41,7 +41,7 @@ class PoseEstimator:
 
     model: Model
     digest: str  # of the model
-    calibration: Calibration
+    probabilities: Probabilities
     config: DetectConfig = field(default_factory=DetectConfig)
     warnings: tuple[str, ...] = ()  # go with every result
 
@@ -56,10 +56,10 @@ class PoseEstimator:
         model = load_model(path)
         fitted = path.with_suffix(".calibration.json")
         own = fitted.is_file()
-        calibration = load_calibration(
+        probabilities = load_probabilities(
             fitted if own else released_file("small").with_suffix(".calibration.json"), EVIDENCE
         )
-        return cls(model, model_digest(model), calibration, config or DetectConfig(), () if own else (_UNFITTED,))
+        return cls(model, model_digest(model), probabilities, config or DetectConfig(), () if own else (_UNFITTED,))
 
     def prepare(self, source: PartSource, unit: str | None = None, name: str | None = None) -> Part:
         """Make a part of a CAD file, a cloud that covers the whole surface, a mesh or an object card.
@@ -146,7 +146,7 @@ class PoseEstimator:
         for one in parts:
             found = detect(
                 self.model,
-                self.calibration,
+                self.probabilities,
                 one.in_unit(scene.unit),
                 scene,
                 seed,

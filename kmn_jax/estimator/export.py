@@ -19,7 +19,7 @@ from kmn_jax.estimator.evidence import Sight, evidence_of
 from kmn_jax.estimator.part import Part
 from kmn_jax.estimator.scene import LEAST_POINTS
 from kmn_jax.estimator.search import SceneArrays, crop_features, search
-from kmn_jax.estimator.select import relations, symmetry_transforms
+from kmn_jax.estimator.select import distances, overlaps, symmetry_transforms
 from kmn_jax.estimator.verify import depth_buffer
 from kmn_jax.files import write_whole
 
@@ -53,7 +53,7 @@ def export_estimator(estimator: PoseEstimator, part: Part, path: str | Path, num
 def _program(estimator: PoseEstimator, part: Part) -> Callable[..., dict[str, Array]]:
     """Return the search as a function of arrays only; all else is part of the program."""
     model, config = estimator.model, estimator.config
-    weights = np.array(estimator.calibration.weights, dtype=np.float32)
+    weights = np.array(estimator.probabilities.found.weights, dtype=np.float32)
     transforms = symmetry_transforms(part.symmetries)
     own, surfels = arrays_of(model, part), surfels_of(part)
     diameter = jnp.float32(part.diameter)
@@ -82,19 +82,15 @@ def _program(estimator: PoseEstimator, part: Part) -> Callable[..., dict[str, Ar
         camera = _fitting_camera(scene)
         sight = Sight(depth_buffer(points, mask, camera, (_SIDE, _SIDE)), camera)
         proof = evidence_of(found, said, crops, own, surfels, sight, settings.verify)
-        logits = estimator.calibration.bias + (proof * weights[None, None]).sum(axis=2)
+        logits = estimator.probabilities.found.bias + (proof * weights[None, None]).sum(axis=2)
         probability = jnp.where(found.found, jax.nn.sigmoid(logits), 0).reshape(-1)
         usable, poses = found.found.reshape(-1), found.T_scene_object.reshape(-1, 4, 4)
         pairs = jnp.stack([poses[first], poses[second]], axis=1)
         count = choice.num_points
-        related = relations(
-            pairs,
-            jnp.asarray(part.points[:count]),
-            jnp.asarray(part.normals[:count]),
-            jnp.asarray(transforms),
-            choice.depth * diameter,
-        )
-        shared = (related.distance <= choice.same_pose * diameter) | (related.overlap > choice.overlap)
+        some = jnp.asarray(part.points[:count])
+        apart = distances(pairs, some, jnp.asarray(transforms))
+        shared = overlaps(pairs, some, jnp.asarray(part.normals[:count]), choice.depth * diameter)
+        shared = (apart <= choice.same_pose * diameter) | (shared > choice.overlap)
         excluded = jnp.zeros((total, total), dtype=bool).at[first, second].set(shared)
         excluded = excluded | excluded.T
 

@@ -21,11 +21,11 @@ from kmn_jax.data.splat import Surfels
 from kmn_jax.estimator.evidence import Sight
 from kmn_jax.estimator.part import Part
 from kmn_jax.estimator.search import SceneArrays, as_visible, each, spread_rows
-from kmn_jax.estimator.select import symmetry_transforms
+from kmn_jax.estimator.select import padded_symmetries
 from kmn_jax.estimator.verify import VerifyConfig, agreement
 from kmn_jax.geometry import compose, inverse, nearest, transform_points
 from kmn_jax.pose import IcpConfig, icp, mssd
-from kmn_jax.typing import Pose, PRNGKey, Scalar
+from kmn_jax.typing import Points, Pose, PRNGKey, Scalar
 
 _ALIKE = 0.3  # cosine of normals, for a point that may lie on a pose's surface
 _SAME = 0.1  # diameters between points of turned and unturned parts that look the same
@@ -71,10 +71,13 @@ def main_turns(part: Part) -> tuple[Float32[np.ndarray, "v 4 4"], Bool[np.ndarra
             pose[:3, 3] = center - pose[:3, :3] @ center
             turns.append(pose)
     poses = np.array(turns, dtype=np.float32)
-    symmetries = symmetry_transforms(part.symmetries)
-    some = part.points[:_COMPARED]
-    moved = np.asarray([[float(mssd(pose, np.eye(4, dtype=np.float32), some, symmetries))] for pose in poses])[:, 0]
-    return poses, moved > _SAME * part.diameter
+    moved = _moved(jnp.asarray(poses), jnp.asarray(part.points[:_COMPARED]), padded_symmetries(part))
+    return poses, np.asarray(moved) > _SAME * part.diameter
+
+
+@jax.jit
+def _moved(poses: Float[Array, "v 4 4"], points: Points, symmetries: Float[Array, "t 4 4"]) -> Float[Array, " v"]:
+    return jax.lax.map(lambda pose: mssd(pose, jnp.eye(4), points, symmetries), poses)
 
 
 @partial(jax.jit, static_argnames=("config", "verify"))

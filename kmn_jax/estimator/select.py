@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from kmn_jax.geometry import compose, inverse, nearest, transform_points
 from kmn_jax.pose import discretise_symmetry, mssd
 from kmn_jax.typing import Normals, Points, Scalar
 
-_LEAST_PAIRS = 256  # the smallest number that is compiled
+_LEAST_PAIRS = 128  # the smallest number that is compiled
 _ALIKE = 0.5  # cosine of normals
 _TURNS = 36  # of a continuous symmetry: 10 degrees, under which poses count as the same anyway
 
@@ -41,22 +42,25 @@ def symmetry_transforms(symmetries: Symmetries) -> Float[np.ndarray, "t 4 4"]:
     return result.astype(np.float32)
 
 
-class Relations(NamedTuple):
-    """How the parts of p pairs of poses lie to each other."""
-
-    distance: Float[Array, " p"]  # of the two poses: MSSD, symmetries forgiven
-    overlap: Float[Array, " p"]  # share of the points of one that is in or on the other, the larger of the two
+def padded_symmetries(part: Part) -> Float[Array, "t 4 4"]:
+    """Return a part's symmetries in a number that is compiled, with the identity after them."""
+    transforms = symmetry_transforms(part.symmetries)
+    spare = (1 << (len(transforms) - 1).bit_length()) - len(transforms)
+    return jnp.asarray(np.concatenate([transforms, np.tile(np.eye(4, dtype=np.float32), (spare, 1, 1))]))
 
 
 @jax.jit
-def relations(
-    pairs: Float[Array, "p 2 4 4"],
-    points: Points,
-    normals: Normals,
-    symmetries: Float[Array, "t 4 4"],
-    depth: Scalar,
-) -> Relations:
-    """Compare pairs of poses by points of the part's surface; `depth` is how far below a surface inside is."""
+def distances(pairs: Float[Array, "p 2 4 4"], points: Points, symmetries: Float[Array, "t 4 4"]) -> Float[Array, " p"]:
+    """Return the MSSD of pairs of poses: how far apart they hold a surface point at most, symmetries forgiven."""
+    return jax.lax.map(lambda pair: mssd(pair[0], pair[1], points, symmetries), pairs)
+
+
+@jax.jit
+def overlaps(pairs: Float[Array, "p 2 4 4"], points: Points, normals: Normals, depth: Scalar) -> Float[Array, " p"]:
+    """Return which share of the points of one part is in or on the other, the larger of the two, for pairs of poses.
+
+    Points deeper than `depth` below the other's surface are in it; nearer ones with a normal like its own are on it.
+    """
 
     def share(pose: Float[Array, "4 4"], other: Float[Array, "4 4"]) -> Scalar:
         between = compose(inverse(other), pose)
@@ -67,11 +71,7 @@ def relations(
         alike = (turned * normals[row]).sum(axis=1) > _ALIKE  # where parts touch, they are opposite
         return (below | ((distance <= depth) & alike)).mean()
 
-    def of(pair: Float[Array, "2 4 4"]) -> Relations:
-        one, other = pair
-        return Relations(mssd(one, other, points, symmetries), jnp.maximum(share(one, other), share(other, one)))
-
-    return jax.lax.map(of, pairs)
+    return jax.lax.map(lambda pair: jnp.maximum(share(pair[0], pair[1]), share(pair[1], pair[0])), pairs)
 
 
 def accept(
@@ -103,33 +103,44 @@ def select(
     config: SelectConfig,
 ) -> Selection:
     """Choose among hypotheses with scores of zero and above."""
-    points, normals = part.points[: config.num_points], part.normals[: config.num_points]
-    middle = np.append((part.minimum + part.maximum) / 2, 1)
-    centers = (poses @ middle)[:, :3]
+    points, normals = (jnp.asarray(array[: config.num_points]) for array in (part.points, part.normals))
+    centers = (poses @ np.append(part.points.mean(axis=0), 1))[:, :3]
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
-    reach = float(np.linalg.norm(part.maximum - part.minimum))  # parts further apart do not touch
-    first, second = np.nonzero(np.triu((apart < reach) & usable[:, None] & usable[None], 1))
-    same, clash = np.zeros((2, len(poses), len(poses)), dtype=bool)
+    # The mean of the points moves no farther than the farthest of them.
+    symmetries = padded_symmetries(part)
+    same = _related(
+        poses,
+        (apart <= config.same_pose * part.diameter) & usable[:, None] & usable[None],
+        lambda pairs: distances(pairs, points, symmetries) <= config.same_pose * part.diameter,
+    )
+    one_each = accept(score, usable, same)
+    depth = jnp.float32(config.depth * part.diameter)
+    clash = _related(
+        poses,
+        (apart <= 2 * part.diameter) & one_each[:, None] & one_each[None],
+        lambda pairs: overlaps(pairs, points, normals, depth) > config.overlap,
+    )
+    kept = accept(score, one_each, clash)
+    # A pose that a better one has ruled out elsewhere is no rival here.
+    better = kept[:, None] & clash & (score[:, None] > score[None])
+    alone = better.sum(axis=0)[None] == better
+    rivals = clash & (one_each & ~kept)[None] & alone
+    gap = score - np.where(rivals, score[None], 0).max(axis=1, initial=0)
+    close = (kept[:, None] & clash & (score[:, None] - score[None] <= config.contest)).any(axis=0)
+    return Selection(kept, gap, one_each & ~kept & close)
+
+
+def _related(
+    poses: Float32[np.ndarray, "s 4 4"],
+    maybe: Bool[np.ndarray, "s s"],
+    holds: Callable[[Float[Array, "p 2 4 4"]], Bool[Array, " p"]],
+) -> Bool[np.ndarray, "s s"]:
+    """Return for which pairs something symmetric holds, of those for which it may."""
+    first, second = np.nonzero(np.triu(maybe, 1))
+    result = np.zeros_like(maybe)
     if len(first):
         slots = max(_LEAST_PAIRS, 1 << (len(first) - 1).bit_length())  # few sizes are compiled
         pairs = np.tile(np.eye(4, dtype=np.float32), (slots, 2, 1, 1))
         pairs[: len(first), 0], pairs[: len(first), 1] = poses[first], poses[second]
-        transforms = symmetry_transforms(part.symmetries)
-        spare = (1 << (len(transforms) - 1).bit_length()) - len(transforms)
-        transforms = np.concatenate([transforms, np.tile(np.eye(4, dtype=np.float32), (spare, 1, 1))])
-        depth = jnp.float32(config.depth * part.diameter)
-        found: Any = jax.device_get(
-            relations(jnp.asarray(pairs), jnp.asarray(points), jnp.asarray(normals), jnp.asarray(transforms), depth)
-        )
-        same[first, second] = (found.distance <= config.same_pose * part.diameter)[: len(first)]
-        clash[first, second] = (found.overlap > config.overlap)[: len(first)]
-    same, clash = same | same.T, clash | clash.T
-    kept = accept(score, usable, same | clash)
-    # A pose that a better one has ruled out elsewhere is no rival here.
-    better = kept[:, None] & (same | clash) & (score[:, None] > score[None])
-    alone = better.sum(axis=0)[None] == better
-    rivals = clash & usable[None] & ~kept[None] & alone
-    gap = score - np.where(rivals, score[None], 0).max(axis=1, initial=0)
-    close = (kept[:, None] & clash & (score[:, None] - score[None] <= config.contest)).any(axis=0)
-    distinct = usable & close & ~kept & ~(same & kept[:, None]).any(axis=0)
-    return Selection(kept, gap, accept(score, distinct, same))
+        result[first, second] = np.asarray(holds(jnp.asarray(pairs)))[: len(first)]
+    return result | result.T

@@ -61,7 +61,7 @@ def test_an_object_in_metres_read_as_millimetres(name: str) -> None:
     found = length_problem(in_unit(RIGHT[name][0], "m"), "mm", scene(RIGHT[name], "mm"))
     assert found is not None
     assert "the object would fit 1000 times larger, so its lengths are probably metres" in found
-    assert found.endswith("give the object's unit as m")
+    assert found.endswith("say --object-units m")
 
 
 def test_the_sentence_as_a_whole() -> None:
@@ -71,7 +71,7 @@ def test_the_sentence_as_a_whole() -> None:
     )
     assert length_problem(60 / 25.4, "mm", scene(MOTOR, "mm")) == (
         "the object of 2.36 mm is far too small for the scene of 500 mm: the object would fit 25.4 times larger, so its"
-        " lengths are probably inches (centimetres for the object would fit, too): give the object's unit as in"
+        " lengths are probably inches (centimetres for the object would fit, too): say --object-units in"
     )
 
 

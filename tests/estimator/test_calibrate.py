@@ -10,10 +10,11 @@ import pytest
 from kmn_jax.checks import InputError
 from kmn_jax.estimator.calibrate import (
     Calibration,
-    calibration_bytes,
+    Probabilities,
     expected_calibration_error,
     fit_calibration,
-    load_calibration,
+    load_probabilities,
+    probabilities_bytes,
     reliability,
 )
 
@@ -55,12 +56,12 @@ def test_reliability_counts_every_pose_once() -> None:
 
 def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.calibration.json"
-    fitted = Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25)
-    path.write_bytes(calibration_bytes(fitted))
-    assert load_calibration(path, NAMES) == fitted
+    fitted = Probabilities(Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25), Calibration(NAMES, (0.0, 1.0, 2.0), -3.0))
+    path.write_bytes(probabilities_bytes(fitted))
+    assert load_probabilities(path, NAMES) == fitted
     with pytest.raises(InputError, match="of other evidence"):
-        load_calibration(path, ("first",))
-    for content in ("", "[]", '{"names": ["first"], "weights": ["x"], "bias": 0}'):
+        load_probabilities(path, ("first",))
+    for content in ("", "[]", "{}", '{"found": 1, "refined": {"names": ["first"], "weights": ["x"], "bias": 0}}'):
         path.write_text(content)
         with pytest.raises(InputError, match="not a readable calibration"):
-            load_calibration(path, ("first",))
+            load_probabilities(path, ("first",))

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from kmn_jax.data.symmetry import Symmetries, rotation_about
 from kmn_jax.estimator.select import (
-    Relations,
     SelectConfig,
     accept,
-    relations,
+    distances,
+    overlaps,
     select,
     symmetry_transforms,
 )
@@ -27,22 +28,19 @@ def moved(x: float, y: float, z: float, rotation: np.ndarray | None = None) -> n
     return pose((x, y, z), np.eye(3) if rotation is None else rotation)
 
 
-def compared(one: np.ndarray, others: list[np.ndarray], transforms: np.ndarray = NO_TURN) -> Relations:
-    pairs = np.stack([np.stack([one, other]) for other in others]).astype(np.float32)
-    return relations(
-        jnp.asarray(pairs),
-        jnp.asarray(BOX.points),
-        jnp.asarray(BOX.normals),
-        jnp.asarray(transforms),
-        jnp.float32(0.05),
-    )
+def pairs(one: np.ndarray, others: list[np.ndarray]) -> jax.Array:
+    return jnp.asarray(np.stack([np.stack([one, other]) for other in others]).astype(np.float32))
+
+
+def apart(one: np.ndarray, others: list[np.ndarray], transforms: np.ndarray = NO_TURN) -> np.ndarray:
+    return np.asarray(distances(pairs(one, others), jnp.asarray(BOX.points), jnp.asarray(transforms)))
 
 
 def test_distances_are_those_of_the_farthest_point() -> None:
     turn = moved(0, 0, 0, rotation_about(Z, np.pi / 2))
-    found = compared(np.eye(4), [np.eye(4), moved(0.3, 0.4, 0), turn])
     farthest = np.linalg.norm(BOX.points - BOX.points @ turn[:3, :3].T, axis=1).max()
-    np.testing.assert_allclose(found.distance, [0, 0.5, farthest], rtol=1e-5, atol=1e-5)
+    found = apart(np.eye(4), [np.eye(4), moved(0.3, 0.4, 0), turn])
+    np.testing.assert_allclose(found, [0, 0.5, farthest], rtol=1e-5, atol=1e-5)
 
 
 def test_symmetric_poses_are_the_same() -> None:
@@ -50,28 +48,29 @@ def test_symmetric_poses_are_the_same() -> None:
     transforms = symmetry_transforms(Symmetries(rotations, np.zeros((0, 3)), np.array([0.1, 0, 0]), 0.02))
     base = pose((1.0, 2.0, 3.0), random_rotations(1, 0)[0])
     same, other = base @ transforms[1], base @ moved(0, 0, 0, rotation_about(Z, 0.5))
-    found = compared(base, [same, other], transforms)
-    np.testing.assert_allclose(found.distance[0], 0, atol=1e-4)
-    assert found.distance[1] > 0.2
+    found = apart(base, [same, other], transforms)
+    np.testing.assert_allclose(found[0], 0, atol=1e-4)
+    assert found[1] > 0.2
     np.testing.assert_allclose(transforms[1] @ [0.1, 0, 0, 1], [0.1, 0, 0, 1], atol=1e-6)  # about the centre
 
 
 def test_continuous_symmetries_are_taken_in_steps() -> None:
     transforms = symmetry_transforms(Symmetries(np.eye(3)[None], Z[None], np.zeros(3), 0.02))
     assert transforms.shape == (36, 4, 4)
-    found = compared(np.eye(4), [moved(0, 0, 0, rotation_about(Z, np.radians(95)))], transforms)
+    found = apart(np.eye(4), [moved(0, 0, 0, rotation_about(Z, np.radians(95)))], transforms)
     widest = np.linalg.norm(BOX.points[:, :2], axis=1).max()
-    np.testing.assert_allclose(found.distance[0], 2 * widest * np.sin(np.radians(2.5)), rtol=1e-3)
+    np.testing.assert_allclose(found[0], 2 * widest * np.sin(np.radians(2.5)), rtol=1e-3)
 
 
 def test_what_two_parts_share_is_counted_but_not_where_they_touch() -> None:
     half_turn = moved(0, 0, 0, rotation_about(Z, np.pi))
-    found = compared(np.eye(4), [np.eye(4), moved(5, 0, 0), moved(0, 1.0, 0), moved(0, 0.4, 0), half_turn])
-    assert found.overlap[0] == 1
-    assert found.overlap[1] == 0
-    assert found.overlap[2] < 0.1  # they touch
-    assert found.overlap[3] > 0.3
-    assert found.overlap[4] > 0.7  # the other way round in the same place
+    others = [np.eye(4), moved(5, 0, 0), moved(0, 1.0, 0), moved(0, 0.4, 0), half_turn]
+    found = overlaps(pairs(np.eye(4), others), jnp.asarray(BOX.points), jnp.asarray(BOX.normals), jnp.float32(0.05))
+    assert found[0] == 1
+    assert found[1] == 0
+    assert found[2] < 0.1  # they touch
+    assert found[3] > 0.2
+    assert found[4] > 0.7  # the other way round in the same place
 
 
 def test_the_best_of_what_excludes_each_other_is_taken() -> None:
