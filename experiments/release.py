@@ -139,7 +139,10 @@ def _card(
     last, network = validated[-1], config["network"]
     devices = sorted({f"{len(each['devices'])} x {each['devices'][0]} ({_processor(each)})" for each in sessions})
     commits = dict.fromkeys(str(each.get("commit") or "not recorded") for each in sessions)
-    commands = dict.fromkeys(" ".join([Path(each["command"][0]).stem, *each["command"][1:]]) for each in sessions)
+    here = f"{Path.cwd()}/"  # paths of this machine are of use to nobody
+    commands = dict.fromkeys(
+        " ".join([Path(each["command"][0]).stem, *each["command"][1:]]).replace(here, "") for each in sessions
+    )
     facts = {
         "Weights": f"`{name}.safetensors`, {parameters:,} parameters, SHA-256 `{digest[:16]}…`",
         "Network": f"N = {network['num_scene_points']} scene points, M = {network['num_object_points']} object points,"

@@ -30,7 +30,8 @@ from kmn_jax.estimator.timing import Clock
 from kmn_jax.models import Model
 
 _SHARES = ("explained", "violated", "occluded", "unknown")
-_LEAST_CROWD = 16  # points
+_LEAST_CROWD = 16  # points of a cell: fewer make no crop
+_COVER_POINTS = 1024  # on a part's surface
 
 
 @dataclass(frozen=True)
@@ -77,19 +78,16 @@ def detect(
         with clock("search"):
             seeds = seeds_over(scene, free, part, config.candidates) if at is None else seeds_at(scene, at)
             rounds.append(find_candidates(model, part, scene, seeds, seed + len(rounds), config.candidates, solver))
-        joined = join(rounds)
         if at is not None or len(rounds) == config.rounds:
             break
         with clock("coverage"):
-            probability = probabilities.found.probability(joined.evidence)
-            accepted = joined.T_view_object[joined.usable & (probability >= config.accepted)]
-            near = config.candidates.seed_spacing / 2 * part.diameter
-            free = scene.foreground & ~_near_places(scene.points, np.asarray(joined.searched.crops.seed), near)
-            free &= ~_near_surface(scene.points, part, accepted, config.explained)
-            free = _crowded(scene.points, free, config.candidates.seed_spacing * part.diameter)
+            last = rounds[-1]
+            likely = last.usable & (probabilities.found.probability(last.evidence) >= config.accepted)
+            free = _uncovered(scene, free, part, last, likely, config)
         if not free.any():
             break
     with clock("selection"):
+        joined = join(rounds)
         choice = _selected(joined, probabilities.found, part, config)
     if choice.kept.any():
         with clock("refinement"):
@@ -118,40 +116,56 @@ def _selected(found: Candidates, calibration: Calibration, part: Part, config: D
     return select(found.T_view_object, probability, few, part, config.select)
 
 
-def _near_places(
-    points: Float32[np.ndarray, "r 3"], places: Float32[np.ndarray, "s 3"], reach: float
+def _uncovered(
+    scene: Scene,
+    free: Bool[np.ndarray, " r"],
+    part: Part,
+    found: Candidates,
+    likely: Bool[np.ndarray, " s"],
+    config: DetectConfig,
 ) -> Bool[np.ndarray, " r"]:
+    """Return the free points that no searched seed is near to and no likely pose explains, but for stray ones."""
     from scipy.spatial import cKDTree
 
-    return np.isfinite(cKDTree(places).query(points, distance_upper_bound=reach)[0])
-
-
-def _crowded(points: Float32[np.ndarray, "r 3"], free: Bool[np.ndarray, " r"], size: float) -> Bool[np.ndarray, " r"]:
-    """Return the free points but for stray ones: in their cell of that size there are too few for a crop."""
     rows = np.flatnonzero(free)
-    cells = np.floor(points[rows] / size).astype(np.int64)
+    spacing = config.candidates.seed_spacing * part.diameter
+    searched = cKDTree(np.asarray(found.searched.crops.seed))
+    near, _ = searched.query(scene.points[rows], distance_upper_bound=spacing / 2)
+    rows = rows[~np.isfinite(near)]
+    for row in _one_a_place(found, likely, part, config.select.same_pose):
+        points = scene.points[rows]
+        rows = rows[~_on_surface(points, part, found.T_view_object[row].astype(np.float64), config.explained)]
+    cells = np.floor(scene.points[rows] / spacing).astype(np.int64)
     _, which, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    crowded = np.zeros_like(free)
-    crowded[rows[counts[which.reshape(-1)] >= _LEAST_CROWD]] = True
-    return crowded
+    result = np.zeros_like(free)
+    result[rows[counts[which.reshape(-1)] >= _LEAST_CROWD]] = True
+    return result
 
 
-def _near_surface(
-    points: Float32[np.ndarray, "r 3"], part: Part, poses: Float32[np.ndarray, "k 4 4"], reach: float
+def _one_a_place(found: Candidates, likely: Bool[np.ndarray, " s"], part: Part, reach: float) -> list[int]:
+    """Return rows of likely candidates whose centres are apart."""
+    centers = (found.T_view_object @ np.append((part.minimum + part.maximum) / 2, 1))[:, :3]
+    chosen: list[int] = []
+    for row in np.flatnonzero(likely).tolist():
+        if all(np.linalg.norm(centers[row] - centers[other]) > reach * part.diameter for other in chosen):
+            chosen.append(row)
+    return chosen
+
+
+def _on_surface(
+    points: Float32[np.ndarray, "r 3"], part: Part, pose: Float[np.ndarray, "4 4"], reach: float
 ) -> Bool[np.ndarray, " r"]:
-    """Return which points lie on the surface of a part at one of the poses."""
+    """Return which points lie on the surface of a part at a pose."""
     from scipy.spatial import cKDTree
 
-    tree = cKDTree(part.points)
-    spacing = float(np.sqrt(part.area / len(part.points)))
-    near = np.zeros(len(points), dtype=bool)
-    center, radius = (part.minimum + part.maximum) / 2, float(np.linalg.norm(part.maximum - part.minimum)) / 2
-    for pose in poses.astype(np.float64):
-        offsets = points - (pose[:3, :3] @ center + pose[:3, 3])
-        rows = np.flatnonzero((offsets**2).sum(axis=1) < (radius + reach * part.diameter) ** 2)
-        local = (points[rows] - pose[:3, 3]) @ pose[:3, :3]
-        near[rows] |= tree.query(local)[0] < reach * part.diameter + spacing
-    return near
+    size = min(len(part.points), _COVER_POINTS)
+    limit = reach * part.diameter + float(np.sqrt(part.area / size))
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    inside = ((local >= part.minimum - limit) & (local <= part.maximum + limit)).all(axis=1)
+    result = np.zeros(len(points), dtype=bool)
+    distance, _ = cKDTree(part.points[:size]).query(local[inside], distance_upper_bound=limit)
+    result[inside] = np.isfinite(distance)
+    return result
 
 
 def _detection(row: int, probability: float, gap: float, found: Candidates, part: Part, scene: Scene) -> Detection:

@@ -89,7 +89,9 @@ def _program(estimator: PoseEstimator, part: Part) -> Callable[..., dict[str, Ar
         count = choice.num_points
         some = jnp.asarray(part.points[:count])
         apart = distances(pairs, some, jnp.asarray(transforms))
-        shared = overlaps(pairs, some, jnp.asarray(part.normals[:count]), choice.depth * diameter)
+        shared = overlaps(
+            pairs, some, jnp.asarray(part.normals[:count]), jnp.sqrt(surfels.area / count), choice.depth * diameter
+        )
         shared = (apart <= choice.same_pose * diameter) | (shared > choice.overlap)
         excluded = jnp.zeros((total, total), dtype=bool).at[first, second].set(shared)
         excluded = excluded | excluded.T

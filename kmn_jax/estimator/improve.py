@@ -7,7 +7,7 @@ once roughly refined, are refined as the pose itself is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import permutations, product
 
@@ -37,16 +37,18 @@ class ImproveConfig:
     """How poses are improved; lengths are shares of the object's diameter."""
 
     alternatives: int = 2  # turned poses that are refined, too
-    margin: float = 0.15  # by which the depth image may speak against a turned pose before it is refined
-    num_points: int = 1024  # of a crop around the pose's seed
-    icp_points: int = 384  # of these, near to the pose's surface
-    object_points: int = 1024  # on the part's surface
+    margin: float = 0.1  # by which the depth image may speak against a turned pose before it is refined
+    num_points: int = 768  # of a crop around the pose's seed
+    icp_points: int = 256  # of these, near to the pose's surface
+    object_points: int = 768  # on the part's surface
     reach: float = 0.1  # how near
-    icp: IcpConfig = field(default_factory=lambda: IcpConfig(iterations=30))
+    icp: IcpConfig = field(default_factory=lambda: IcpConfig(iterations=15))
     rough_turns: int = 8  # the best turns as they are, which are roughly refined
-    rough_icp: IcpConfig = field(default_factory=lambda: IcpConfig(iterations=10, distance_gate=0.2))
+    rough_icp: IcpConfig = field(default_factory=lambda: IcpConfig(iterations=6, distance_gate=0.2))
     rough_points: int = 128  # of the crop
-    rough_surfels: int = 512  # by which turns are compared with the depth image
+    raw_tolerance: float = 0.1  # of depths, for turns as they are: the pose is not exact
+    tolerance: float = 0.05  # the same, once they are roughly refined
+    rough_surfels: int = 512  # by which turns are compared with the depth image and the crop
     normal_radius: float = 0.06
     normal_points: int = 4096
 
@@ -104,27 +106,28 @@ def improve(
         normal_points=config.normal_points,
         min_points=1,
     )
-    count = config.object_points
-    points, normals = surfels.points[:count], surfels.normals[:count]
-    few = Surfels(points[: config.rough_surfels], normals[: config.rough_surfels], surfels.area)
+    many, few = (
+        Surfels(surfels.points[:count], surfels.normals[:count], surfels.area)
+        for count in (config.object_points, config.rough_surfels)
+    )
 
     def one(pose: Pose, seed: Int[Array, ""], key: Key[Array, ""]) -> tuple[Float[Array, "a 4 4"], Bool[Array, " a"]]:
         crop = crop_around(key, visible, seed, scene.mask[seed], jnp.zeros((1, 3)), jnp.eye(4)[None], diameter, crops)
         shown = crop.points + crop.seed[None]
 
-        def score(pose: Pose) -> Scalar:
-            seen = agreement(pose, few, sight.depth, sight.camera, diameter, verify)
+        def score(pose: Pose, tolerance: float) -> Scalar:
+            seen = agreement(pose, few, sight.depth, sight.camera, diameter, replace(verify, tolerance=tolerance))
             return seen.explained - seen.violated
 
-        def refined(pose: Pose, count: int, settings: IcpConfig) -> Pose:
+        def refined(pose: Pose, surface: Surfels, count: int, settings: IcpConfig) -> Pose:
             to_object = inverse(pose)
-            row, distance = nearest(transform_points(to_object, shown), points)
+            row, distance = nearest(transform_points(to_object, shown), few.points)
             turned = jnp.matmul(crop.normals, to_object[:3, :3].T, precision=jax.lax.Precision.HIGHEST)
-            cosine = (turned * normals[row]).sum(axis=1)
+            cosine = (turned * few.normals[row]).sum(axis=1)
             near = crop.mask & (distance <= config.reach * diameter) & (cosine > _ALIKE)
             rows, there = spread_rows(near, count)
             fine = icp(
-                points,
+                surface.points,
                 shown[rows],
                 pose,
                 diameter,
@@ -135,16 +138,17 @@ def improve(
             return fine.T_scene_object
 
         turned = jax.lax.map(lambda turn: compose(pose, turn), turns)
-        raw = jnp.where(is_other, jax.lax.map(score, turned), -jnp.inf)
+        raw = jnp.where(is_other, jax.lax.map(lambda pose: score(pose, config.raw_tolerance), turned), -jnp.inf)
         hope, rows = jax.lax.top_k(raw, config.rough_turns)
-        rough = jax.lax.map(lambda start: refined(start, config.rough_points, config.rough_icp), turned[rows])
-        scores = jnp.where(jnp.isfinite(hope), jax.lax.map(score, rough), -jnp.inf)
+        rough = jax.lax.map(lambda start: refined(start, few, config.rough_points, config.rough_icp), turned[rows])
+        scores = jax.lax.map(lambda pose: score(pose, config.tolerance), rough)
+        scores = jnp.where(jnp.isfinite(hope), scores, -jnp.inf)
         best, rows = jax.lax.top_k(scores, config.alternatives)
-        there = jnp.concatenate([jnp.ones(1, dtype=bool), best >= score(pose) - config.margin])
+        there = jnp.concatenate([jnp.ones(1, dtype=bool), best >= score(pose, config.tolerance) - config.margin])
         starts = jnp.concatenate([pose[None], rough[rows]])
 
         def finish(start: Pose, there: Bool[Array, ""]) -> Pose:
-            return jax.lax.cond(there, lambda: refined(start, config.icp_points, config.icp), lambda: start)
+            return jax.lax.cond(there, lambda: refined(start, many, config.icp_points, config.icp), lambda: start)
 
         return jax.lax.map(lambda item: finish(*item), (starts, there)), there
 

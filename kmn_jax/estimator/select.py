@@ -13,11 +13,11 @@ from jaxtyping import Array, Bool, Float, Float32
 
 from kmn_jax.data.symmetry import Symmetries
 from kmn_jax.estimator.part import Part
-from kmn_jax.geometry import compose, inverse, nearest, transform_points
+from kmn_jax.geometry import compose, inverse, squared_distances, transform_points
 from kmn_jax.pose import discretise_symmetry, mssd
 from kmn_jax.typing import Normals, Points, Scalar
 
-_LEAST_PAIRS = 128  # the smallest number that is compiled
+_PAIRS = 64  # that are compared in one call: one number, so one compilation
 _ALIKE = 0.5  # cosine of normals
 _TURNS = 36  # of a continuous symmetry: 10 degrees, under which poses count as the same anyway
 
@@ -30,7 +30,7 @@ class SelectConfig:
     depth: float = 0.05  # a point so far below another part's surface is inside of it
     overlap: float = 0.15  # share of a part's points that may be inside of another part, or on the same surface
     contest: float = 0.2  # difference of scores up to which another pose may turn out to be better
-    num_points: int = 256  # on the surface, that are compared
+    num_points: int = 128  # on the surface, that are compared
 
 
 def symmetry_transforms(symmetries: Symmetries) -> Float[np.ndarray, "t 4 4"]:
@@ -56,20 +56,32 @@ def distances(pairs: Float[Array, "p 2 4 4"], points: Points, symmetries: Float[
 
 
 @jax.jit
-def overlaps(pairs: Float[Array, "p 2 4 4"], points: Points, normals: Normals, depth: Scalar) -> Float[Array, " p"]:
+def overlaps(
+    pairs: Float[Array, "p 2 4 4"], points: Points, normals: Normals, spacing: Scalar, depth: Scalar
+) -> Float[Array, " p"]:
     """Return which share of the points of one part is in or on the other, the larger of the two, for pairs of poses.
 
     Points deeper than `depth` below the other's surface are in it; nearer ones with a normal like its own are on it.
+    `spacing` is how far the points are apart.
     """
+
+    offsets = (points * normals).sum(axis=1)
 
     def share(pose: Float[Array, "4 4"], other: Float[Array, "4 4"]) -> Scalar:
         between = compose(inverse(other), pose)
         seen = transform_points(between, points)
-        row, distance = nearest(seen, points)
-        below = ((seen - points[row]) * normals[row]).sum(axis=1) < -depth
-        turned = jnp.matmul(normals, between[:3, :3].T, precision=jax.lax.Precision.HIGHEST)
+        away = jnp.sqrt(squared_distances(seen, points))
+        nearest = away.min(axis=1, keepdims=True)
+        highest = jax.lax.Precision.HIGHEST
+        heights = jnp.matmul(seen, normals.T, precision=highest) - offsets[None]
+        # Beyond an edge a point is below one face, but not below all that are about as near.
+        height = jnp.where(away <= nearest + spacing, heights, -jnp.inf).max(axis=1)
+        row = jnp.argmin(away, axis=1)
+        turned = jnp.matmul(normals, between[:3, :3].T, precision=highest)
         alike = (turned * normals[row]).sum(axis=1) > _ALIKE  # where parts touch, they are opposite
-        return (below | ((distance <= depth) & alike)).mean()
+        flush = jnp.abs(heights[jnp.arange(len(row)), row]) <= depth
+        on = flush & (nearest[:, 0] <= depth + spacing) & alike
+        return ((height < -depth) | on).mean()
 
     return jax.lax.map(lambda pair: jnp.maximum(share(pair[0], pair[1]), share(pair[1], pair[0])), pairs)
 
@@ -92,7 +104,7 @@ class Selection(NamedTuple):
 
     kept: Bool[np.ndarray, " s"]
     gap: Float[np.ndarray, " s"]  # of what is kept; the score itself where nothing competes
-    contenders: Bool[np.ndarray, " s"]  # other poses for the places of what is kept, that score nearly as high
+    contenders: Bool[np.ndarray, " s"]  # the best other pose for the place of each that is kept, if nearly as good
 
 
 def select(
@@ -115,10 +127,11 @@ def select(
     )
     one_each = accept(score, usable, same)
     depth = jnp.float32(config.depth * part.diameter)
+    spacing = jnp.float32(np.sqrt(part.area / len(points)))
     clash = _related(
         poses,
         (apart <= 2 * part.diameter) & one_each[:, None] & one_each[None],
-        lambda pairs: overlaps(pairs, points, normals, depth) > config.overlap,
+        lambda pairs: overlaps(pairs, points, normals, spacing, depth) > config.overlap,
     )
     kept = accept(score, one_each, clash)
     # A pose that a better one has ruled out elsewhere is no rival here.
@@ -126,8 +139,12 @@ def select(
     alone = better.sum(axis=0)[None] == better
     rivals = clash & (one_each & ~kept)[None] & alone
     gap = score - np.where(rivals, score[None], 0).max(axis=1, initial=0)
-    close = (kept[:, None] & clash & (score[:, None] - score[None] <= config.contest)).any(axis=0)
-    return Selection(kept, gap, one_each & ~kept & close)
+    contenders = np.zeros_like(kept)
+    for row in np.flatnonzero(kept):
+        others = np.where(clash[row] & one_each & ~kept, score, -np.inf)
+        if others.max() >= score[row] - config.contest:
+            contenders[others.argmax()] = True
+    return Selection(kept, gap, contenders)
 
 
 def _related(
@@ -138,9 +155,9 @@ def _related(
     """Return for which pairs something symmetric holds, of those for which it may."""
     first, second = np.nonzero(np.triu(maybe, 1))
     result = np.zeros_like(maybe)
-    if len(first):
-        slots = max(_LEAST_PAIRS, 1 << (len(first) - 1).bit_length())  # few sizes are compiled
-        pairs = np.tile(np.eye(4, dtype=np.float32), (slots, 2, 1, 1))
-        pairs[: len(first), 0], pairs[: len(first), 1] = poses[first], poses[second]
-        result[first, second] = np.asarray(holds(jnp.asarray(pairs)))[: len(first)]
+    for start in range(0, len(first), _PAIRS):
+        one, other = first[start : start + _PAIRS], second[start : start + _PAIRS]
+        pairs = np.tile(np.eye(4, dtype=np.float32), (_PAIRS, 2, 1, 1))
+        pairs[: len(one), 0], pairs[: len(one), 1] = poses[one], poses[other]
+        result[one, other] = np.asarray(holds(jnp.asarray(pairs)))[: len(one)]
     return result | result.T

@@ -65,7 +65,10 @@ def test_continuous_symmetries_are_taken_in_steps() -> None:
 def test_what_two_parts_share_is_counted_but_not_where_they_touch() -> None:
     half_turn = moved(0, 0, 0, rotation_about(Z, np.pi))
     others = [np.eye(4), moved(5, 0, 0), moved(0, 1.0, 0), moved(0, 0.4, 0), half_turn]
-    found = overlaps(pairs(np.eye(4), others), jnp.asarray(BOX.points), jnp.asarray(BOX.normals), jnp.float32(0.05))
+    spacing = jnp.float32((BOX.area / len(BOX.points)) ** 0.5)
+    found = overlaps(
+        pairs(np.eye(4), others), jnp.asarray(BOX.points), jnp.asarray(BOX.normals), spacing, jnp.float32(0.05)
+    )
     assert found[0] == 1
     assert found[1] == 0
     assert found[2] < 0.1  # they touch
@@ -88,7 +91,7 @@ def test_one_pose_an_instance_is_kept_and_rivals_for_its_place_make_the_gap(firs
     there = moved(0, 0, 3)
     near = moved(0.02, 0, 3.01)
     crossed = there @ moved(0, 0.1, 0.1, rotation_about(Z, np.pi / 2))
-    poses = np.stack([there, near, crossed, moved(0, 1.2, 3)]).astype(np.float32)
+    poses = np.stack([there, near, crossed, moved(0, 2.5, 3)]).astype(np.float32)
     score = np.array([0.9, 0.8, 0.7, 0.6])
     score[first] = 0.95
     found = select(poses, score, np.ones(4, dtype=bool), BOX, SelectConfig())
