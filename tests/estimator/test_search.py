@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from kmn_jax.data.splat import Intrinsics, Surfels
+from kmn_jax.estimator.evidence import EVIDENCE, Sight, evidence_of
 from kmn_jax.estimator.search import (
-    Hypotheses,
     PartArrays,
     SceneArrays,
     SearchConfig,
@@ -18,6 +19,7 @@ from kmn_jax.estimator.search import (
     search,
     spread_seeds,
 )
+from kmn_jax.estimator.verify import VerifyConfig, depth_buffer
 from kmn_jax.models import Model, create_model, encode_object
 from kmn_jax.pose import RansacConfig
 from tests.reference.clouds import box_cloud
@@ -46,13 +48,21 @@ def scene(count: int = 700, capacity: int = 1024, seed: int = 0) -> SceneArrays:
     return SceneArrays(jnp.asarray(points), jnp.arange(capacity) < count)
 
 
-def run(model: Model, part: PartArrays, where: SceneArrays, seeds: list[int], real: int | None = None) -> Hypotheses:
+def run(
+    model: Model, part: PartArrays, where: SceneArrays, seeds: list[int], real: int | None = None
+) -> dict[str, jax.Array]:
+    """Return the fields of hypotheses and predictions, and the evidence."""
     rows, flags = jnp.asarray(seeds, "i4"), jnp.arange(len(seeds)) < (len(seeds) if real is None else real)
     one, other = jax.random.split(jax.random.key(0))
     crops = crop_features(
         model.graphdef, model.parameters, where, rows, flags, part.diameter, one, CONFIG, num_points=64
     )
-    return search(model.graphdef, model.parameters, part, crops, other, CONFIG)
+    found, said = search(model.graphdef, model.parameters, part, crops, other, CONFIG)
+    surfels = Surfels(part.points, part.normals, jnp.float32(10))
+    camera = Intrinsics(*(jnp.float32(number) for number in (50, 50, 32, 32, 64, 64)))
+    sight = Sight(depth_buffer(where.points, where.mask, camera, (64, 64)), camera)
+    proof = evidence_of(found, said, crops, part, surfels, sight, VerifyConfig())
+    return found._asdict() | said._asdict() | {"evidence": proof}
 
 
 def test_seeds_are_candidates_far_from_each_other() -> None:
@@ -82,37 +92,42 @@ def test_few_candidates_come_again_and_are_told() -> None:
 
 def test_hypotheses_are_finite_and_those_of_their_key(model: Model, part: PartArrays) -> None:
     where = scene()
-    found = run(model, part, where, [0, 10, 200])
-    for name, value in found._asdict().items():
+    found, again = (run(model, part, where, [0, 10, 200]) for _ in range(2))
+    for name, value in found.items():
         assert value.shape[0] == 3
         assert bool(jnp.isfinite(value).all()), name
-    again = run(model, part, where, [0, 10, 200])
-    for one, other in zip(found, again, strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert np.allclose(np.linalg.det(np.asarray(found.T_scene_object)[:, :3, :3]), 1, atol=1e-4)
-    assert bool((found.object_share <= 1).all())
+        np.testing.assert_array_equal(value, again[name])
+    assert np.allclose(np.linalg.det(np.asarray(found["T_scene_object"])[..., :3, :3]), 1, atol=1e-4)
+    np.testing.assert_allclose(found["scores"].sum(axis=2), 1, atol=1e-4)
+    evidence = dict(zip(EVIDENCE, np.moveaxis(np.asarray(found["evidence"]), 2, 0), strict=True))
+    total = sum(evidence[name] for name in ("explained", "violated", "occluded", "unknown"))
+    assert ((np.abs(total - 1) < 1e-3) | (total == 0)).all()  # nothing of a pose behind the sensor is visible
+    for name in set(EVIDENCE) - {"log_inliers", "straight"}:
+        assert (evidence[name] >= 0).all(), name
+        assert (evidence[name] <= 1.001).all(), name
 
 
 def test_a_seed_among_nothing_gives_no_pose(model: Model, part: PartArrays) -> None:
     points = jnp.zeros((1024, 3)).at[:, 2].set(1.0).at[0].set(jnp.array([50.0, 0, 1]))
     found = run(model, part, SceneArrays(points, jnp.arange(1024) < 1), [0, 0, 0])
-    assert not bool(found.found.any())
-    assert bool(jnp.isfinite(found.T_scene_object).all())
+    assert not bool(found["found"].any())
+    assert bool(jnp.isfinite(found["T_scene_object"]).all())
+    assert bool(jnp.isfinite(found["evidence"]).all())
 
 
 def test_seeds_that_are_not_real_are_skipped(model: Model, part: PartArrays) -> None:
     all_three, first_two = (run(model, part, scene(), [5, 9, 60], real) for real in (3, 2))
-    assert bool(all_three.on_object[2].any())
-    assert not bool(first_two.found[2])
-    assert not bool(first_two.on_object[2].any())
-    np.testing.assert_array_equal(first_two.T_scene_object[2], np.eye(4))
-    for name in all_three._fields:
-        np.testing.assert_array_equal(getattr(all_three, name)[:2], getattr(first_two, name)[:2])
+    assert bool((all_three["scores"][2] > 0).any())
+    assert not bool(first_two["found"][2].any())
+    assert not bool(first_two["on_object"][2].any())
+    np.testing.assert_array_equal(first_two["T_scene_object"][2], np.tile(np.eye(4), (CONFIG.num_modes, 1, 1)))
+    for name, value in all_three.items():
+        np.testing.assert_array_equal(value[:2], first_two[name][:2])
 
 
 def test_padding_changes_nothing(model: Model, part: PartArrays) -> None:
     where = scene()
     rubbish = jnp.where(where.mask[:, None], where.points, 6.0)
     one, other = (run(model, part, where._replace(points=points), [5, 9, 60]) for points in (where.points, rubbish))
-    for name in one._fields:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    for name, value in one.items():
+        np.testing.assert_array_equal(value, other[name])
