@@ -1,7 +1,7 @@
 """Fit the probabilities of detections: `python -m experiments.calibrate [MODEL.safetensors]`.
 
 Poses are searched in the validation bins (`python -m experiments.build_data validation-bins`), whose objects the
-network was not trained with; in some of them also a part that is not there. A logistic model of the evidence is fitted
+network was not trained with; in each of them also a part that is not there. A logistic model of the evidence is fitted
 to whether they are right. Each object's probabilities are also predicted by a model that was fitted without it, which
 gives the reliability that is printed.
 """
@@ -46,7 +46,6 @@ from kmn_jax.files import write_whole
 from kmn_jax.models import Model, load_model, load_pretrained
 from kmn_jax.report import check_target, print_table, write_json
 
-STRANGERS = 2  # in every so many images, a part that is not there is searched as well
 SHIPPED = Path(__file__).parent.parent / "kmn_jax" / "pretrained" / "small.calibration.json"
 
 
@@ -74,9 +73,9 @@ def collect(options: Options) -> dict[str, np.ndarray]:
         raise InputError(f"{options.bins} holds no datasets: python -m experiments.build_data validation-bins")
     for number, folder in enumerate(folders):
         images = bin_images(folder, SPLIT, model, options.every)
-        for row, image in enumerate(tqdm(images, unit="image", desc=folder.name)):
+        for image in tqdm(images, unit="image", desc=folder.name):
             seeds = seeds_over(image.scene, image.scene.foreground, image.part, config)
-            parts = [image.part] if row % STRANGERS or image.stranger is None else [image.part, image.stranger]
+            parts = [part for part in (image.part, image.stranger) if part is not None]
             for part in parts:
                 stages = _found_and_refined(model, part, image.scene, seeds, config, SOLVERS[options.method])
                 for refined, found in enumerate(stages):

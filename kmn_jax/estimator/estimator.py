@@ -115,7 +115,7 @@ class PoseEstimator:
         scan: ScanSource | Scene,
         *,
         seed: int = 0,
-        at: Float[np.ndarray, "k 3"] | None = None,
+        at: Float[np.ndarray, "*k 3"] | None = None,
         top: int | None = None,
         clock: Clock | None = None,
         **options: Any,
@@ -134,7 +134,7 @@ class PoseEstimator:
             if one.model_digest != self.digest:
                 raise InputError(f"the part {one.name} was prepared with other weights: prepare it with this estimator")
         clock = clock or Clock()
-        places = None if at is None else np.atleast_2d(np.asarray(float_array(at, "at", (None, 3)), dtype=float))
+        places = None if at is None else np.asarray(float_array(np.atleast_2d(at), "at", (None, 3)), dtype=float)
         if isinstance(scan, Scene):
             scene = scan
         else:

@@ -19,6 +19,7 @@ EVIDENCE = (
     "violated",
     "occluded",
     "unknown",
+    "sunk",
     "confirmed",  # explained, of what was explained or violated
     "fit",  # share of the points on the object that are near to the pose's surface
     "rms_error",  # of these, in diameters

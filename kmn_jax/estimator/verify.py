@@ -17,17 +17,21 @@ class VerifyConfig:
     """Set the comparison; the tolerance is a share of the object's diameter."""
 
     tolerance: float = 0.03  # between predicted and measured depth
+    sunk: float = 0.2  # what lies in front by less than this is more likely the surface itself than another part
     window: int = 1  # pixels to each side in which a measurement may lie: edges are off by one
     splat: SplatConfig = field(default_factory=lambda: SplatConfig(resolution=128))
 
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
-        if not self.tolerance > 0 or self.window < 0:
-            raise ValueError(f"tolerance = {self.tolerance} must be above zero and window = {self.window} not below it")
+        if not 0 < self.tolerance < self.sunk or self.window < 0:
+            raise ValueError(
+                f"tolerance = {self.tolerance} must be above zero and below sunk = {self.sunk}, and window ="
+                f" {self.window} not below zero"
+            )
 
 
 class Agreement(NamedTuple):
-    """Shares of the picture area that an object at a pose would cover if nothing hid it; they sum up to 1.
+    """Shares of the picture area that an object at a pose would cover if nothing hid it; the first four sum up to 1.
 
     Missing measurements, as on shiny flanks, speak neither for nor against a pose.
     """
@@ -36,6 +40,7 @@ class Agreement(NamedTuple):
     violated: Scalar  # the sensor saw through it: something was measured behind
     occluded: Scalar  # something was measured in front
     unknown: Scalar  # nothing was measured
+    sunk: Scalar  # of what is occluded, the share of the whole that something hides from close by
 
 
 def agreement(
@@ -62,11 +67,14 @@ def agreement(
     def share(which: Bool[Array, " m"]) -> Scalar:
         return jnp.where(which, weight, 0).sum()
 
+    occluded = some & ~behind & ~near
+    close = (there & (gap < 0) & (gap > -config.sunk * diameter)).any(axis=1)
     return Agreement(
         explained=share(near),
         violated=share(some & behind & ~near),
-        occluded=share(some & ~behind & ~near),
+        occluded=share(occluded),
         unknown=share(~some),
+        sunk=share(occluded & close),
     )
 
 

@@ -103,7 +103,8 @@ def ransac_modes(key: ArrayInput, matches: Matches, count: int, config: RansacCo
 
     Each is the best one left whose rotation differs by more than `mode_degrees`, or whose place of the matched points'
     mean by more than `mode_distance` diameters, from those before. Nearly symmetric parts have several; which one is
-    right is for the surface to say. The first is that of `ransac`. Errors as there, and for a count below 1.
+    right is for the surface to say. The first is that of `ransac`, up to rounding. Errors as there, and for a count
+    below 1.
     """
     if count < 1:
         raise InputError(f"count is {count}, but at least one pose is needed")
@@ -185,13 +186,6 @@ def _ransac(key: PRNGKey, matches: Matches, config: RansacConfig, num_modes: int
         return agree, squares
 
     counts = jax.vmap(lambda pose: inliers(pose, config.distance_gate)[0].sum(dtype=jnp.int32))(poses)
-    score = jnp.where(is_candidate, counts, -1)
-    modes, there = [], []
-    for _ in range(num_modes):
-        row = jnp.argmax(score)
-        modes.append(poses[row])
-        there.append(score[row] >= 0)
-        score = jnp.where(_differ(poses, poses[row], config), score, -1)
 
     def refine(pose: Pose, gate: Scalar) -> tuple[Pose, None]:
         inlier_weights = jnp.where(inliers(pose, gate)[0], weights, 0)
@@ -199,8 +193,16 @@ def _ransac(key: PRNGKey, matches: Matches, config: RansacConfig, num_modes: int
         # Kabsch always answers; with inliers on a line, or none, the answer would be arbitrary.
         return jnp.where(rotation_is_determined(object_points, inlier_weights), refined, pose), None
 
+    gates = jnp.array(config.refinement_gates, dtype=jnp.float32)
+    score = jnp.where(is_candidate, counts, -1)
+    modes, there = [], []
+    for _ in range(num_modes):
+        row = jnp.argmax(score)
+        modes.append(jax.lax.scan(refine, poses[row], gates)[0])
+        there.append(score[row] >= 0)
+        score = jnp.where(_differ(poses, modes[-1], config), score, -1)
+
     def finish(best: Pose, is_there: Bool[Array, ""]) -> PoseResult:
-        best, _ = jax.lax.scan(refine, best, jnp.array(config.refinement_gates, dtype=jnp.float32))
         inlier_mask, squares = inliers(best, config.distance_gate)
         num_inliers = inlier_mask.sum(dtype=jnp.int32)
         share = jnp.ceil(config.min_inlier_share * num_usable.astype(jnp.float32)).astype(jnp.int32)

@@ -86,4 +86,4 @@ def test_a_wall_behind_contradicts_a_pose_in_the_air(depth: jax.Array) -> None:
 
 def test_behind_the_camera_nothing_is_known(depth: jax.Array) -> None:
     found = check(moved(0, 0, -10), SURFELS, depth, CAMERA, DIAMETER, config=CONFIG)
-    assert [float(part) for part in found] == [0, 0, 0, 0]
+    assert [float(part) for part in found] == [0, 0, 0, 0, 0]
