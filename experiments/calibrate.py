@@ -58,6 +58,9 @@ class Options:
     bins: Path = Path("outputs/validation_bins")  # folder with datasets in BOP format
     every: int = 1  # use every so many images
     folds: int = 5
+    absent_weight: float = (
+        3.0  # of refined poses of parts that are not there: real scenes hold much that is not the part
+    )
     output: Path = SHIPPED  # the calibration
     candidates: Path | None = None  # .npz file to write the candidates to, or to read them from if it exists
     json: Path | None = None
@@ -99,14 +102,18 @@ def _found_and_refined(
     return [found, improved(model, part, scene, found, rows, 0, config)] if len(rows) else [found]
 
 
-def fit(evidence: np.ndarray, right: np.ndarray, objects: np.ndarray, folds: int) -> tuple[Calibration, dict[str, Any]]:
+def fit(
+    evidence: np.ndarray, error: np.ndarray, objects: np.ndarray, absent_weight: float, folds: int
+) -> tuple[Calibration, dict[str, Any]]:
     """Return the model of all poses, and how well models predict the objects that they were not fitted to."""
+    right, there = error < THRESHOLD, np.isfinite(error)
+    weights = np.where(there, 1.0, absent_weight)
     held_out = np.zeros(len(right))
     names = np.unique(objects)
     for fold in range(folds):
         own = np.isin(objects, names[fold::folds])
-        held_out[own] = fit_calibration(evidence[~own], right[~own], EVIDENCE).probability(evidence[own])
-    model = fit_calibration(evidence, right, EVIDENCE)
+        held_out[own] = fit_calibration(evidence[~own], right[~own], EVIDENCE, weights[~own]).probability(evidence[own])
+    model = fit_calibration(evidence, right, EVIDENCE, weights)
     accepted = held_out >= 0.5
     summary = {
         "objects": len(names),
@@ -114,14 +121,15 @@ def fit(evidence: np.ndarray, right: np.ndarray, objects: np.ndarray, folds: int
         "right": float(right.mean()),
         "expected calibration error": expected_calibration_error(held_out, right),
         "right among accepted": float(right[accepted].mean()) if accepted.any() else None,
+        "right among accepted where the part is": float(right[accepted & there].mean()),
         "accepted among right": float(accepted[right].mean()),
     }
     table = [
         {"probability": mean, "share right": share, "poses": count}
         for mean, share, count in reliability(held_out, right)
     ]
-    weights = dict(zip(EVIDENCE, model.weights, strict=True)) | {"bias": model.bias}
-    return model, {"summary": summary, "reliability": table, "weights": weights}
+    slopes = dict(zip(EVIDENCE, model.weights, strict=True)) | {"bias": model.bias}
+    return model, {"summary": summary, "reliability": table, "weights": slopes}
 
 
 def calibrate(options: Options) -> dict[str, Any]:
@@ -136,8 +144,9 @@ def calibrate(options: Options) -> dict[str, Any]:
             np.savez(options.candidates, allow_pickle=False, **poses)
     models, results = [], {}
     for name, own in (("found", ~poses["refined"]), ("refined", poses["refined"])):
-        right = poses["error"][own] < THRESHOLD
-        model, results[name] = fit(poses["evidence"][own], right, poses["object"][own], options.folds)
+        weight = options.absent_weight if name == "refined" else 1.0
+        evidence, error, objects = (poses[column][own] for column in ("evidence", "error", "object"))
+        model, results[name] = fit(evidence, error, objects, weight, options.folds)
         models.append(model)
         print_table(f"Reliability of poses as {name}, of objects that were not fitted to", results[name]["reliability"])
         print_table(f"Poses as {name}", [results[name]["summary"]])

@@ -30,9 +30,12 @@ class Calibration:
 
 
 def fit_calibration(
-    evidence: Float[np.ndarray, "s f"], right: Bool[np.ndarray, " s"], names: Sequence[str]
+    evidence: Float[np.ndarray, "s f"],
+    right: Bool[np.ndarray, " s"],
+    names: Sequence[str],
+    weights: Float[np.ndarray, " s"] | None = None,
 ) -> Calibration:
-    """Fit by Newton's method to poses of which it is known whether they are right.
+    """Fit by Newton's method to poses of which it is known whether they are right; `weights` count some as several.
 
     Raises InputError if all are right or all are wrong.
     """
@@ -43,18 +46,19 @@ def fit_calibration(
     mean, scale = evidence.mean(axis=0), evidence.std(axis=0)
     scale = np.where(scale > 0, scale, 1)
     columns = np.concatenate([(evidence - mean) / scale, np.ones((len(evidence), 1))], axis=1).astype(np.float64)
-    ridge = _RIDGE * len(right) * np.append(np.ones(len(scale)), 0.0)
+    counts = np.ones(len(right)) if weights is None else weights
+    ridge = _RIDGE * counts.sum() * np.append(np.ones(len(scale)), 0.0)
     solution = np.zeros(columns.shape[1])
     for _ in range(50):
         predicted = 1 / (1 + np.exp(-columns @ solution))
-        gradient = columns.T @ (predicted - right) + ridge * solution
-        curvature = (columns * (predicted * (1 - predicted))[:, None]).T @ columns + np.diag(ridge + 1e-9)
+        gradient = columns.T @ (counts * (predicted - right)) + ridge * solution
+        curvature = (columns * (counts * predicted * (1 - predicted))[:, None]).T @ columns + np.diag(ridge + 1e-9)
         step = np.linalg.solve(curvature, gradient)
         solution -= step
         if np.abs(step).max() < 1e-8:
             break
-    weights = solution[:-1] / scale
-    return Calibration(tuple(names), tuple(weights.tolist()), float(solution[-1] - weights @ mean))
+    slopes = solution[:-1] / scale
+    return Calibration(tuple(names), tuple(slopes.tolist()), float(solution[-1] - slopes @ mean))
 
 
 def expected_calibration_error(

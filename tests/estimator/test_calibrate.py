@@ -38,6 +38,15 @@ def test_a_known_model_is_found_and_its_probabilities_hold() -> None:
     assert expected_calibration_error(np.full(len(right), 0.99), right) > 0.2
 
 
+def test_a_weight_counts_a_pose_several_times() -> None:
+    evidence, right = drawn(500)
+    twice = np.concatenate([evidence, evidence[:100]]), np.concatenate([right, right[:100]])
+    weights = np.where(np.arange(500) < 100, 2.0, 1.0)
+    # Columns are scaled by the spread of what is given, so the ridge differs a little.
+    weighted, repeated = fit_calibration(evidence, right, NAMES, weights), fit_calibration(*twice, NAMES)
+    np.testing.assert_allclose(weighted.probability(evidence), repeated.probability(evidence), atol=0.01)
+
+
 def test_evidence_that_decides_completely_keeps_finite_weights() -> None:
     evidence = np.array([[0.0], [0.1], [0.9], [1.0]], dtype=np.float32)
     fitted = fit_calibration(evidence, np.array([False, False, True, True]), ("only",))
