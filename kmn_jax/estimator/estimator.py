@@ -161,7 +161,7 @@ class PoseEstimator:
     def estimate(
         self,
         part: Part,
-        crop: Float[np.ndarray, "n 3"] | Sequence[Float[np.ndarray, "n 3"]],
+        crop: Float[np.ndarray, "_ 3"] | Sequence[Float[np.ndarray, "_ 3"]],
         *,
         seed: int = 0,
         unit: str | None = None,
