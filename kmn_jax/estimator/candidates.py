@@ -118,14 +118,13 @@ def find_candidates(
     """
     crop_key, pose_key = jax.random.split(jax.random.key(seed))
     crops = _crops(model, part, scene, seeds, crop_key, seed, config)
+    arrays = arrays_of(model, part)
     if solver is None:
-        found, said = search(model.graphdef, model.parameters, arrays_of(model, part), crops, pose_key, config.search)
+        found, said = search(model.graphdef, model.parameters, arrays, crops, pose_key, config.search)
     else:
         found, said = solver(part, scene, crops, pose_key)
     crops = crops._replace(features=crops.features[:, :, :0])
-    proof = _evidence_of(
-        found, said, crops, arrays_of(model, part), surfels_of(part), sight_of(scene), config=config.verify
-    )
+    proof = _evidence_of(found, said, crops, arrays, surfels_of(part), sight_of(scene), config=config.verify)
     host: Any = jax.device_get((found, proof, seeds.rows, crops, said))
     real = np.flatnonzero(seeds.real)
     found, proof, *searched = jax.tree.map(lambda leaf: leaf[real], host)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.symmetry import Symmetries
@@ -22,6 +22,7 @@ from kmn_jax.estimator.candidates import (
     seeds_over,
 )
 from kmn_jax.estimator.evidence import EVIDENCE
+from kmn_jax.estimator.frames import into, placed
 from kmn_jax.estimator.part import Part
 from kmn_jax.estimator.result import Detection, Detections
 from kmn_jax.estimator.scene import Scene
@@ -132,9 +133,13 @@ def _uncovered(
     searched = cKDTree(np.asarray(found.searched.crops.seed))
     near, _ = searched.query(scene.points[rows], distance_upper_bound=spacing / 2)
     rows = rows[~np.isfinite(near)]
+    size = min(len(part.points), _COVER_POINTS)
+    surface, reach = cKDTree(part.points[:size]), config.explained * part.diameter + float(np.sqrt(part.area / size))
     for row in _one_a_place(found, likely, part, config.select.same_pose):
-        points = scene.points[rows]
-        rows = rows[~_on_surface(points, part, found.T_view_object[row].astype(np.float64), config.explained)]
+        local = into(found.T_view_object[row].astype(np.float64), scene.points[rows])
+        inside = np.flatnonzero(((local >= part.minimum - reach) & (local <= part.maximum + reach)).all(axis=1))
+        distance, _ = surface.query(local[inside], distance_upper_bound=reach)
+        rows = np.delete(rows, inside[np.isfinite(distance)])
     cells = np.floor(scene.points[rows] / spacing).astype(np.int64)
     _, which, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     result = np.zeros_like(free)
@@ -152,40 +157,20 @@ def _one_a_place(found: Candidates, likely: Bool[np.ndarray, " s"], part: Part, 
     return chosen
 
 
-def _on_surface(
-    points: Float32[np.ndarray, "r 3"], part: Part, pose: Float[np.ndarray, "4 4"], reach: float
-) -> Bool[np.ndarray, " r"]:
-    """Return which points lie on the surface of a part at a pose."""
-    from scipy.spatial import cKDTree
-
-    size = min(len(part.points), _COVER_POINTS)
-    limit = reach * part.diameter + float(np.sqrt(part.area / size))
-    local = (points - pose[:3, 3]) @ pose[:3, :3]
-    inside = ((local >= part.minimum - limit) & (local <= part.maximum + limit)).all(axis=1)
-    result = np.zeros(len(points), dtype=bool)
-    distance, _ = cKDTree(part.points[:size]).query(local[inside], distance_upper_bound=limit)
-    result[inside] = np.isfinite(distance)
-    return result
-
-
 def _detection(row: int, probability: float, gap: float, found: Candidates, part: Part, scene: Scene) -> Detection:
     T_scene_view = scene.view.T_scene_view
     pose = T_scene_view @ found.T_view_object[row].astype(np.float64)
     pose = canonical_pose(pose, part.symmetries)
     shares = {name: float(found.evidence[row, EVIDENCE.index(name)]) for name in _SHARES}
     prediction = crop_prediction(found, row)
-
-    def to_scene(points: Float32[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
-        return points @ T_scene_view[:3, :3].T + T_scene_view[:3, 3]
-
     return Detection(
         T_scene_object=pose,
         probability=probability,
         num_inliers=int(found.num_inliers[row]),
         visible_fraction=1 - shares["occluded"],
         runner_up_gap=gap,
-        seed=to_scene(np.asarray(found.searched.crops.seed[found.crop[row]])),
-        prediction=replace(prediction, points=to_scene(prediction.points).astype(np.float32)),
+        seed=placed(T_scene_view, np.asarray(found.searched.crops.seed[found.crop[row]])),
+        prediction=replace(prediction, points=placed(T_scene_view, prediction.points).astype(np.float32)),
         warnings=("the part is symmetric: of the poses that look the same, this is the canonical one",)
         if part.is_symmetric
         else (),

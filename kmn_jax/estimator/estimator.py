@@ -20,6 +20,7 @@ from kmn_jax.data.units import length_problem, scene_size
 from kmn_jax.estimator.calibrate import Probabilities, load_probabilities
 from kmn_jax.estimator.detect import DetectConfig, detect
 from kmn_jax.estimator.evidence import EVIDENCE
+from kmn_jax.estimator.frames import into
 from kmn_jax.estimator.part import Part, load_part, make_part, model_digest
 from kmn_jax.estimator.result import Detections
 from kmn_jax.estimator.scene import Scene, make_scene
@@ -99,7 +100,7 @@ class PoseEstimator:
         view = view_of(read, sensor)
         diameter = part.in_unit(read.unit).diameter
         front, warnings = _foreground(read, view, diameter, background or ForegroundOptions())
-        places = None if at is None else _to_view(at, view.T_scene_view)
+        places = None if at is None else into(view.T_scene_view, at)
         most = self.config.candidates.most_points
         return make_scene(view, read.unit, front, most, places, (*self.warnings, *warnings))
 
@@ -141,7 +142,7 @@ class PoseEstimator:
             with clock("scene"):
                 smallest = min(parts, key=lambda one: one.in_unit("m").diameter)
                 scene = self.scene(scan, smallest, at=places, **options)
-        in_view = None if places is None else _to_view(places, scene.view.T_scene_view)
+        in_view = None if places is None else into(scene.view.T_scene_view, places)
         results = []
         for one in parts:
             found = detect(
@@ -193,17 +194,13 @@ def _foreground(
     inside, _ = foreground(scan, diameter, region)
     empty = options.background
     if empty is not None:
-        empty = replace(empty, points=_to_view(empty.points, view.T_scene_view).astype(np.float32), depth=None)
+        empty = replace(empty, points=into(view.T_scene_view, empty.points).astype(np.float32), depth=None)
     rows = np.flatnonzero(inside[view.rows])
     seen = Scan(view.points[rows], None, None, None, scan.unit)
     front, warnings = foreground(seen, diameter, replace(options, roi=None, background=empty))
     result = np.zeros(len(view.points), dtype=bool)
     result[rows[front]] = True
     return result, warnings
-
-
-def _to_view(places: Float[np.ndarray, "k 3"], T_scene_view: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "k 3"]:
-    return (places - T_scene_view[:3, 3]) @ T_scene_view[:3, :3]
 
 
 def _scan(source: ScanSource, unit: str, camera: str | Path | None) -> Scan:

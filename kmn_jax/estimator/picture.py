@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Float32
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.scene import Camera
+from kmn_jax.estimator.frames import placed
 from kmn_jax.estimator.part import Part
 from kmn_jax.estimator.picture_legend import LIKELY, NOT_THE_PART, center_of, draw_list, draw_part, ranked, summary
 from kmn_jax.estimator.raster import (
@@ -85,11 +86,6 @@ def save_picture(
     content = io.BytesIO()
     canvas.print_png(content)
     write_whole(path, content.getvalue())
-
-
-def placed(T: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Return points of a pose's source frame in its target frame."""
-    return points @ T[:3, :3].T + T[:3, 3]
 
 
 class _Drawing:

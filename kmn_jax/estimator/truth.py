@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
+from kmn_jax.estimator.frames import into
 from kmn_jax.estimator.part import Part
 from kmn_jax.estimator.result import Detection
 from kmn_jax.estimator.select import symmetry_transforms
@@ -72,8 +73,3 @@ def surface_distances(part: Part, points: Float[np.ndarray, "n 3"]) -> Float[np.
     # Discs stick out over edges, but not by more than the part's box allows.
     from_box = np.linalg.norm(np.maximum(np.maximum(part.minimum - points, points - part.maximum), 0), axis=1)
     return np.maximum(from_discs, from_box)
-
-
-def into(T: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Return points of a pose's target frame in its source frame."""
-    return (points - T[:3, 3]) @ T[:3, :3]

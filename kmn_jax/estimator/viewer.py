@@ -38,18 +38,6 @@ _LAYERS = {  # what can be switched: whether it is shown at first, and what it i
 }
 
 
-def serve(
-    view: View,
-    part: Part,
-    found: Detections,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    on_pick: OnPick | None = None,
-) -> Viewer:
-    """Start a page and return it, see `Viewer`; its `url` is where to look at it."""
-    return Viewer(view, part, found, host, port, on_pick)
-
-
 class Viewer:
     """A page that is being served, until `stop` or the end of a `with` block.
 

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, UInt8, UInt32
 
+from kmn_jax.estimator.frames import into, placed
 from kmn_jax.estimator.part import Part
-from kmn_jax.estimator.picture import RELIEF, placed
+from kmn_jax.estimator.picture import RELIEF
 from kmn_jax.estimator.picture_legend import LIKELY, NOT_THE_PART, center_of
 from kmn_jax.estimator.raster import as_bytes, depth_colors, distinct_colors, image_places, relief_of, surface_discs
 from kmn_jax.estimator.result import Detection
-from kmn_jax.estimator.truth import into
 from kmn_jax.estimator.view import View
 
 _FIELD_OF_VIEW = np.radians(40)

@@ -43,7 +43,7 @@ from kmn_jax.train.sharding import (
     put_whole,
 )
 from kmn_jax.train.snapshot import Snapshot, from_first_process
-from kmn_jax.train.sources import training_source, validation_source
+from kmn_jax.train.sources import ignore, training_source, validation_source
 from kmn_jax.train.step import Metrics, Samples, create_state, index_of, mean_metrics, total_sums
 from kmn_jax.train.stop import StopRequest
 from kmn_jax.train.transfer import FILE_LIMIT, MANIFEST, export_snapshot, import_snapshot
@@ -143,7 +143,7 @@ class _Run:
     ) -> None:
         self.config, self.folder, self.mesh, self.stop = config, folder, mesh, stop
         self.first = jax.process_index() == 0
-        self.report = report if self.first else _ignore
+        self.report = report if self.first else ignore
         size = config.pipeline.batch_size
         check_batch(size, config.step, mesh)
         self.training, self.validation = (
@@ -378,7 +378,3 @@ def _print(message: str) -> None:
     from tqdm import tqdm
 
     tqdm.write(message)
-
-
-def _ignore(message: str) -> None:
-    pass

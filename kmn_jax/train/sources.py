@@ -34,11 +34,11 @@ class Source:
     read: Callable[[SampleIndex], Samples] | None = None  # makes a batch on the host, if the steps do not
 
 
-def _ignore(problem: str) -> None:
-    pass
+def ignore(message: str) -> None:
+    """Report nothing."""
 
 
-def training_source(config: TrainConfig, mesh: Mesh, report: Report = _ignore) -> Source:
+def training_source(config: TrainConfig, mesh: Mesh, report: Report = ignore) -> Source:
     """Return the training objects, or the configured share of them, and their endless samples.
 
     What is left out goes to `report`, of images also while they are read.
@@ -53,7 +53,7 @@ def training_source(config: TrainConfig, mesh: Mesh, report: Report = _ignore) -
     return _source(config, stacked, config.pipeline, mesh, report, ordered=False)
 
 
-def validation_source(config: TrainConfig, mesh: Mesh, report: Report = _ignore) -> Source:
+def validation_source(config: TrainConfig, mesh: Mesh, report: Report = ignore) -> Source:
     """Return the validation objects and their fixed samples, in order, as one pass; see `training_source`."""
     stacked = stack_pack(Pack(config.pack), "validation", _with_bits(config))
     pipeline = replace(config.pipeline, samples_per_object=config.validation_samples, seed=_VALIDATION_SEED)

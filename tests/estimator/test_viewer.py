@@ -19,7 +19,7 @@ from kmn_jax.checks import InputError
 from kmn_jax.estimator.raster import distinct_colors
 from kmn_jax.estimator.result import Detections, Timing
 from kmn_jax.estimator.view import View
-from kmn_jax.estimator.viewer import Viewer, serve
+from kmn_jax.estimator.viewer import Viewer
 from kmn_jax.estimator.viewer_scene import nearest_to_ray
 from tests.estimator.box_sample import FRONT, POSES, SIZES, both_boxes, box_part, box_view, detection
 from tests.reference.meshes import pose, random_rotations
@@ -150,7 +150,7 @@ def count_like(browser: Any, color: np.ndarray) -> int:
 def test_the_page_shows_the_poses_and_switches_them(browser: Any, sample: tuple[View, Detections]) -> None:
     view, found = sample
     blue, _ = distinct_colors(2)
-    with serve(view, PART, found, port=0) as page:
+    with Viewer(view, PART, found, port=0) as page:
         look_at(browser, page)
         for words in (
             "box",
@@ -219,7 +219,7 @@ def test_a_failed_search_is_a_message_and_the_page_lives_on(
     view, found = sample
     search = Picker(InputError("this place holds 3 points: pick another one"))
     search.may_answer.set()
-    with serve(view, PART, found, port=0, on_pick=search) as page:
+    with Viewer(view, PART, found, port=0, on_pick=search) as page:
         look_at(browser, page)
         size = browser.find_element("tag name", "canvas").size
         right = size["width"] // 5  # messages cover the left
@@ -255,7 +255,7 @@ def test_a_failed_search_is_a_message_and_the_page_lives_on(
 
 def test_what_is_shown_may_change_and_be_nothing(sample: tuple[View, Detections], picked: Detections) -> None:
     view, found = sample
-    with serve(view, PART, found, port=0) as page:
+    with Viewer(view, PART, found, port=0) as page:
         page.show(picked)
         assert page.is_shown(1)
         with pytest.raises(IndexError):
@@ -269,17 +269,17 @@ def test_what_is_shown_may_change_and_be_nothing(sample: tuple[View, Detections]
 def test_a_port_in_use_is_refused_and_a_stopped_page_frees_it(sample: tuple[View, Detections]) -> None:
     view, found = sample
     threads = set(threading.enumerate())
-    page = serve(view, PART, found, port=0)
+    page = Viewer(view, PART, found, port=0)
     port = int(page.url.rsplit(":", 1)[1])
     assert page.url == f"http://127.0.0.1:{port}"
     with pytest.raises(InputError, match=rf"port {port} of 127.0.0.1 cannot be used \(.*in use\): choose another one"):
-        serve(view, PART, found, port=port)
+        Viewer(view, PART, found, port=port)
     page.stop()
     page.wait()
     with socket.socket() as trial, pytest.raises(ConnectionRefusedError):
         trial.connect(("127.0.0.1", port))
     eventually(lambda: set(threading.enumerate()) <= threads)
-    with serve(view, PART, found, port=port) as again:
+    with Viewer(view, PART, found, port=port) as again:
         assert again.url == page.url
 
 
@@ -295,7 +295,7 @@ def test_places_that_are_not_ours_are_refused(
     sample: tuple[View, Detections], place: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
-        serve(sample[0], PART, sample[1], **({"port": 0} | place))
+        Viewer(sample[0], PART, sample[1], **({"port": 0} | place))
 
 
 def test_a_ray_meets_the_first_point_that_is_near_to_it() -> None:
