@@ -49,8 +49,9 @@ from kmn_jax.train.stop import StopRequest
 from kmn_jax.train.transfer import FILE_LIMIT, MANIFEST, export_snapshot, import_snapshot
 from kmn_jax.train.window import MEANS, Window
 
-# What a resumed run may change: how long it is, where its pack lies, and what it writes when.
-_FREE = ("name", "pack", "num_steps", "validate_every", "checkpoint_every", "log_every")
+# What a resumed run may change: how long it is, where its pack lies, what it writes when, and the share of examples
+# with random keypoints, as the last steps may be spent on those that the estimator uses.
+_FREE = ("name", "pack", "num_steps", "validate_every", "checkpoint_every", "log_every", "examples.random_keypoints")
 _CARRIED = ("metrics.jsonl", "sessions.jsonl", "model.safetensors")  # go with an export
 _READERS = 4  # threads that read images ahead
 _AHEAD = 2  # steps that are dispatched before the metrics of one are read
