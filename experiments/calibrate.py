@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from experiments.bins import THRESHOLD, bin_images
 from experiments.fpfh import SOLVERS
+from experiments.reliability_picture import save_reliability
 from experiments.test_sets import SPLIT
 from kmn_jax.checks import InputError
 from kmn_jax.estimator.calibrate import (
@@ -38,7 +39,7 @@ from kmn_jax.estimator.candidates import (
     improved,
     seeds_over,
 )
-from kmn_jax.estimator.evidence import EVIDENCE
+from kmn_jax.estimator.evidence import EVIDENCE, SIGNS
 from kmn_jax.estimator.part import Part
 from kmn_jax.estimator.scene import Scene
 from kmn_jax.estimator.select import SelectConfig, select
@@ -58,12 +59,11 @@ class Options:
     bins: Path = Path("outputs/validation_bins")  # folder with datasets in BOP format
     every: int = 1  # use every so many images
     folds: int = 5
-    absent_weight: float = (
-        3.0  # of refined poses of parts that are not there: real scenes hold much that is not the part
-    )
+    absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
     output: Path = SHIPPED  # the calibration
     candidates: Path | None = None  # .npz file to write the candidates to, or to read them from if it exists
     json: Path | None = None
+    picture: Path | None = None  # .png file for the reliability diagram
 
 
 def collect(options: Options) -> dict[str, np.ndarray]:
@@ -112,16 +112,18 @@ def fit(
     names = np.unique(objects)
     for fold in range(folds):
         own = np.isin(objects, names[fold::folds])
-        held_out[own] = fit_calibration(evidence[~own], right[~own], EVIDENCE, weights[~own]).probability(evidence[own])
-    model = fit_calibration(evidence, right, EVIDENCE, weights)
+        others = fit_calibration(evidence[~own], right[~own], EVIDENCE, weights[~own], SIGNS)
+        held_out[own] = others.probability(evidence[own])
+    model = fit_calibration(evidence, right, EVIDENCE, weights, SIGNS)
     accepted = held_out >= 0.5
+    present = accepted & there
     summary = {
         "objects": len(names),
         "poses": len(right),
         "right": float(right.mean()),
         "expected calibration error": expected_calibration_error(held_out, right),
         "right among accepted": float(right[accepted].mean()) if accepted.any() else None,
-        "right among accepted where the part is": float(right[accepted & there].mean()),
+        "right among accepted where the part is": float(right[present].mean()) if present.any() else None,
         "accepted among right": float(accepted[right].mean()),
     }
     table = [
@@ -134,7 +136,8 @@ def fit(
 
 def calibrate(options: Options) -> dict[str, Any]:
     """Fit, write and print. Raises InputError if there is nothing to fit to."""
-    check_target(options.json)
+    for target in (options.json, options.picture):
+        check_target(target)
     if options.candidates is not None and options.candidates.exists():
         with np.load(options.candidates) as stored:
             poses = dict(stored)
@@ -152,6 +155,7 @@ def calibrate(options: Options) -> dict[str, Any]:
         print_table(f"Poses as {name}", [results[name]["summary"]])
     write_whole(options.output, probabilities_bytes(Probabilities(*models)))
     write_json(options.json, results)
+    save_reliability({f"poses as {name}": found["reliability"] for name, found in results.items()}, options.picture)
     return results
 
 

@@ -1,9 +1,10 @@
 """Whole-bin detection on ray-cast bins: `python -m experiments.detect_bins`.
 
 Precision and recall of the copies found in the held-out test sets, by the released network and by Open3D's FPFH +
-RANSAC + ICP from the same seeds: verification, choice and order are the same, and each has probabilities fitted to its
-own poses in the validation bins. A pose is right if its ADI to a copy is below a tenth of the diameter and no more
-probable pose took that copy; recall counts the copies of which at least 30% is visible.
+RANSAC + ICP in the same search (the first round's seeds are the same, later ones depend on what was found):
+verification, choice and order are the same, and each has probabilities fitted to its own poses in the validation bins.
+A pose is right if its ADI to a copy is below a tenth of the diameter and no more probable pose took that copy; recall
+counts the copies of which at least 30% is visible.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from tqdm import tqdm
 from experiments.bins import THRESHOLD, BinImage, bin_images
 from experiments.calibrate import SHIPPED
 from experiments.fpfh import SOLVERS
+from experiments.reliability_picture import save_reliability
 from experiments.test_sets import SPLIT
 from kmn_jax.checks import InputError
 from kmn_jax.estimator.calibrate import Probabilities, expected_calibration_error, load_probabilities, reliability
@@ -44,6 +46,7 @@ class Options:
     calibration: Path = SHIPPED
     fpfh_calibration: Path = Path("outputs/fpfh.calibration.json")  # python -m experiments.calibrate --method FPFH
     json: Path | None = None
+    picture: Path | None = None  # .png file for the reliability diagram
 
 
 @dataclass
@@ -93,7 +96,8 @@ class Tally:
 
 def run(options: Options) -> dict[str, Any]:
     """Detect, print and return the numbers."""
-    check_target(options.json)
+    for target in (options.json, options.picture):
+        check_target(target)
     unknown = [name for name in options.methods if name not in SOLVERS]
     if unknown:
         raise InputError(f"method {unknown[0]!r} is not known: choose among {', '.join(SOLVERS)}")
@@ -126,6 +130,7 @@ def run(options: Options) -> dict[str, Any]:
         print_table(f"Reliability of {name}", curves[name])
     results = {"detection": rows, "reliability": curves}
     write_json(options.json, results)
+    save_reliability(curves, options.picture)
     return results
 
 

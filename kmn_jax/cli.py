@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 Units = Literal["auto", "mm", "cm", "m", "in"]
 
+_SAME_SIZE = 0.03  # between the lengths of a part and of the same one in a dataset
 _VECTORS = ("--at", "--sensor", "--roi")  # flags whose values may begin with a minus sign
 
 
@@ -35,8 +36,8 @@ class Request:
     """Cloud (PLY, PCD, XYZ, NPY, NPZ), depth image (PNG, TIFF, EXR, NPY, NPZ) or depth image of a BOP dataset."""
     camera: Path | None = None
     """JSON with fx, fy, cx, cy, or cam_K, and perhaps depth_scale; depth images outside of BOP datasets need it."""
-    at: tuple[str, ...] = ()
-    """X,Y,Z: search around these points of the scene only; several may be given."""
+    at: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """X,Y,Z: search around this point of the scene only; it may be given several times."""
     units: Units = "auto"
     """Unit of the scene's lengths; auto: that of the object, or what the format says."""
     object_units: Units = "auto"
@@ -71,8 +72,8 @@ def prepare(
     """
     from kmn_jax.estimator import PoseEstimator, save_part
 
-    target = output or source.with_suffix(".kmn")
     part = PoseEstimator.from_pretrained(weights).prepare(source, _unit(units))
+    target = output or source.with_suffix(".kmn")
     save_part(part, target)
     print(f"{part.name}: {_size(part)}, {_symmetry(part)}; wrote {target}")
 
@@ -100,6 +101,10 @@ def estimate(
     for target in (json, bop_csv, save_picture):
         if target is not None and not target.parent.is_dir():
             raise InputError(f"cannot write {target}: its folder does not exist")
+    if save_picture is not None:
+        from kmn_jax.estimator.picture import check_picture
+
+        check_picture(save_picture)
     session = _Session(request)
     found = session.detect(session.places)
     if top is not None:
@@ -224,7 +229,7 @@ class _Session:
         return self.estimator.detect(self.part, self.scene, seed=self._request.seed, at=places, clock=clock)
 
     def _read(self, path: Path) -> Scan:
-        from kmn_jax.data.bop_scans import bop_scan, is_bop_image
+        from kmn_jax.data.bop_scans import bop_scan, bop_scene_id, bop_sizes, is_bop_image
         from kmn_jax.data.scan_files import read_scan
         from kmn_jax.data.units import resolve_unit
 
@@ -233,10 +238,15 @@ class _Session:
             return read_scan(path, resolve_unit(request.units, self.part.unit), request.camera)
         scan, instances = bop_scan(path, resolve_unit(request.units, self.part.unit, "mm"))
         if path == request.scene:
+            part, sizes = self.part.in_unit("mm"), bop_sizes(path)
+            own = (part.diameter, *np.sort(part.maximum - part.minimum))
+            # A dataset's object of another size is not the part; of several that may be, none is known to be.
             objects = {instance.object_id for instance in instances or ()}
-            self.bop_ids = (int(path.parent.parent.name), int(path.stem), min(objects) if len(objects) == 1 else 1)
-            if instances is not None and len(objects) == 1:  # else it is not known which of them is meant
-                self.truth = tuple(instance.T_camera_object for instance in instances)
+            alike = [number for number in objects if np.allclose(sizes.get(number, own), own, rtol=_SAME_SIZE)]
+            self.bop_ids = (bop_scene_id(path), int(path.stem), alike[0] if len(alike) == 1 else 1)
+            if len(alike) == 1:
+                copies = [instance for instance in instances or () if instance.object_id == alike[0]]
+                self.truth = tuple(instance.T_camera_object for instance in copies)
         return scan
 
 

@@ -20,6 +20,7 @@ from kmn_jax.data.bop_scans import bop_scan
 ASSETS = Path(__file__).parent.parent / "experiments" / "assets"
 IMAGE = sorted((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))[0]
 MOTOR = ASSETS / "industrial" / "gear_motor.stl"
+SHAFT = ASSETS / "industrial" / "shaft.stl"
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +78,18 @@ def test_a_cloud_around_a_point(card: Path, cloud: Path, tmp_path: Path) -> None
     place = ",".join(f"{x:.3f}" for x in np.load(cloud)[100])
     assert main(["estimate", "--object", str(card), "--scene", str(cloud), "--at", place, "--json", str(target)]) == 0
     assert json.loads(target.read_text())["seed"] == 0
+    both = ["--at", place, "--at", ",".join(f"{x:.3f}" for x in np.load(cloud)[2000])]
+    assert main(["estimate", "--object", str(card), "--scene", str(cloud), *both, "--json", str(target)]) == 0
+
+
+def test_a_relative_path_and_another_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(IMAGE.parent)
+    target = tmp_path / "a.csv"
+    code = main(["estimate", "--object", str(SHAFT), "--scene", IMAGE.name, "--bop-csv", str(target)])
+    assert code == 0, capsys.readouterr().err
+    assert {row.object_id for row in read_results(target, "mm")} <= {1}  # not that of the motor, which is 2
 
 
 def test_bad_input_is_one_sentence_and_exit_2(
@@ -104,6 +117,9 @@ def test_bad_input_is_one_sentence_and_exit_2(
         ({"--at": "1,2"}, "--at"),
         ({"--roi": "1,2,3,0,0,0"}, "roi"),
         ({"--top": "0"}, "top"),
+        ({"--seed": str(2**63)}, "seed"),
+        ({"--save-picture": str(tmp_path / "a.jpg")}, "PNG"),
+        ({"--at": "9000,9000,9000"}, "away from the nearest measured point"),
         ({"--json": str(tmp_path / "missing" / "a.json")}, "folder does not exist"),
         ({"--weights": "large"}, "no released model"),
     ]
@@ -115,6 +131,7 @@ def test_bad_input_is_one_sentence_and_exit_2(
         assert message in error, error
         assert error.count("\n") == 1, error
     assert main(["prepare", str(tmp_path / "nothing.stl")]) == 2
+    assert main(["prepare", "."]) == 2
 
 
 def test_a_killed_command_leaves_no_half_written_file(tmp_path: Path) -> None:

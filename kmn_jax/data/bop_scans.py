@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from kmn_jax.checks import InputError
 from kmn_jax.data.bop_files import millimetres
 from kmn_jax.data.bop_frames import BopInstance
+from kmn_jax.data.bop_models import read_models
 from kmn_jax.data.bop_reader import FrameReader, Scene
 from kmn_jax.data.scan_files import DepthCamera, Scan, depth_scan
 
@@ -50,6 +53,25 @@ def bop_scan(path: str | Path, unit: str = "mm") -> tuple[Scan, tuple[BopInstanc
         return depth_scan(frame.depth, intrinsics, unit), frame.instances
     except InputError as error:
         raise InputError(f"{path} cannot be used: {error}") from None
+
+
+def bop_scene_id(path: str | Path) -> int:
+    """Return the number of an image's scene: the name of its folder, 0 if that is no number."""
+    place = _scene_of(Path(path))
+    name = "" if place is None else place[0].name
+    return int(name) if name.isascii() and name.isdigit() else 0
+
+
+def bop_sizes(path: str | Path) -> dict[int, tuple[float, float, float, float]]:
+    """Return diameter and extents, in ascending order (mm), of the objects of an image's dataset.
+
+    Those of which its models_info.json does not tell are left out.
+    """
+    place = _scene_of(Path(path))
+    if place is None:
+        return {}
+    models, _ = read_models(place[0].parent.parent / "models", "mm")
+    return {number: (model.diameter, *np.sort(model.size).tolist()) for number, model in models.items()}
 
 
 def _scene_of(path: Path) -> tuple[Path, str | None] | None:

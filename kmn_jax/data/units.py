@@ -114,6 +114,19 @@ def length_problem(diameter: float, object_unit: str, scene: SceneSize) -> str |
     return f"{fault}: the {which} would fit {change}, so its lengths are probably {_NAMES[unit]}{too}: {say}"
 
 
+def length_doubt(diameter: float, object_unit: str, scene: SceneSize) -> str | None:
+    """Tell in a clause which other unit of the scene would be more usual, None if none would.
+
+    It is for scenes in which nothing was found: their lengths can be right, but need not be.
+    """
+    oddities = {unit: _oddity(diameter, object_unit, scene, unit) for unit in METRES}
+    possible = [unit for unit in METRES if _fault(diameter, object_unit, scene, unit) is None]
+    likeliest = min(possible, key=lambda unit: oddities[unit], default=scene.unit)
+    if oddities[likeliest] >= oddities[scene.unit]:
+        return None
+    return f"if the scan's lengths are {_NAMES[likeliest]}, not {_NAMES[scene.unit]}, say --units {likeliest}"
+
+
 def _fault(diameter: float, object_unit: str, scene: SceneSize, scene_unit: str) -> str | None:
     """Say what cannot be if the lengths of both were in the given units."""
     factor = METRES[scene_unit] / METRES[object_unit]

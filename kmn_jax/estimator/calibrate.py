@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -25,8 +25,7 @@ class Calibration:
 
     def probability(self, evidence: Float[np.ndarray, "s f"]) -> Float[np.ndarray, " s"]:
         """Return the probability that each pose is right."""
-        logits = self.bias + evidence.astype(np.float64) @ np.array(self.weights)
-        return 1 / (1 + np.exp(-np.clip(logits, -50, 50)))
+        return _logistic(self.bias + evidence.astype(np.float64) @ np.array(self.weights))
 
 
 def fit_calibration(
@@ -34,11 +33,15 @@ def fit_calibration(
     right: Bool[np.ndarray, " s"],
     names: Sequence[str],
     weights: Float[np.ndarray, " s"] | None = None,
+    signs: Mapping[str, int] | None = None,
 ) -> Calibration:
-    """Fit by Newton's method to poses of which it is known whether they are right; `weights` count some as several.
+    """Fit to poses of which it is known whether they are right; `weights` count some as several.
 
-    Raises InputError if all are right or all are wrong.
+    Columns whose sign is 1 may only speak for a pose, those of -1 only against it: what is fitted then holds better
+    in scenes of another kind. Raises InputError if all are right or all are wrong.
     """
+    from scipy.optimize import minimize
+
     if right.all() or not right.any():
         raise InputError(
             f"{int(right.sum())} of {len(right)} poses are right: to fit probabilities, some must be wrong"
@@ -48,17 +51,24 @@ def fit_calibration(
     columns = np.concatenate([(evidence - mean) / scale, np.ones((len(evidence), 1))], axis=1).astype(np.float64)
     counts = np.ones(len(right)) if weights is None else weights
     ridge = _RIDGE * counts.sum() * np.append(np.ones(len(scale)), 0.0)
-    solution = np.zeros(columns.shape[1])
-    for _ in range(50):
-        predicted = 1 / (1 + np.exp(-columns @ solution))
-        gradient = columns.T @ (counts * (predicted - right)) + ridge * solution
-        curvature = (columns * (counts * predicted * (1 - predicted))[:, None]).T @ columns + np.diag(ridge + 1e-9)
-        step = np.linalg.solve(curvature, gradient)
-        solution -= step
-        if np.abs(step).max() < 1e-8:
-            break
+
+    def loss(solution: Float[np.ndarray, " g"]) -> tuple[float, Float[np.ndarray, " g"]]:
+        logits = columns @ solution
+        value = counts @ (np.logaddexp(0, logits) - right * logits) + ridge @ solution**2 / 2
+        slope = columns.T @ (counts * (_logistic(logits) - right)) + ridge * solution
+        return float(value / counts.sum()), slope / counts.sum()
+
+    ranges = {1: (0, None), -1: (None, 0), 0: (None, None)}
+    bounds = [ranges[(signs or {}).get(name, 0)] for name in names] + [ranges[0]]
+    start = np.zeros(columns.shape[1])
+    options = {"maxiter": 10_000, "maxfun": 100_000, "ftol": 1e-15, "gtol": 1e-9}
+    solution = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     slopes = solution[:-1] / scale
     return Calibration(tuple(names), tuple(slopes.tolist()), float(solution[-1] - slopes @ mean))
+
+
+def _logistic(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
+    return 1 / (1 + np.exp(-np.clip(logits, -50, 50)))
 
 
 def expected_calibration_error(

@@ -33,6 +33,7 @@ from kmn_jax.models import Model
 from kmn_jax.typing import PRNGKey
 
 NUM_SEEDS = 32  # that are searched in one call: one number, so one compilation
+_TRIES = 4  # crops around a place that was asked for
 _VERIFIED_POINTS = 2048  # on an object's surface
 _REMEMBERED = 8  # searches of a scene, of tens of megabytes each
 _LENGTH_STEP = 1.02  # parts whose diameters are nearer than that share crops and their features
@@ -87,17 +88,20 @@ class Candidates(NamedTuple):
 Solver: TypeAlias = Callable[[Part, Scene, CropFeatures, PRNGKey], tuple[Hypotheses, Predictions]]
 
 
-def seeds_over(scene: Scene, open_points: Bool[np.ndarray, " r"], part: Part, config: CandidateConfig) -> Seeds:
-    """Return seeds spread over points of the scene, no more than it takes to be near to all of them."""
+def seeds_over(
+    scene: Scene, open_points: Bool[np.ndarray, " r"], part: Part, config: CandidateConfig, most: int = NUM_SEEDS
+) -> Seeds:
+    """Return up to `most` seeds spread over points of the scene, no more than it takes to be near to all of them."""
     flags = padded_flags(open_points, scene.arrays.mask.shape[0])
     cells = np.floor(scene.points[open_points] / (config.seed_spacing * part.diameter)).astype(np.int64)
     rows, real = spread_seeds(scene.arrays, flags, count=NUM_SEEDS)
-    return Seeds(rows, real & (np.arange(NUM_SEEDS) < len(np.unique(cells, axis=0))))
+    return Seeds(rows, real & (np.arange(NUM_SEEDS) < min(most, len(np.unique(cells, axis=0)))))
 
 
 def seeds_at(scene: Scene, places: Float[np.ndarray, "k 3"]) -> Seeds:
-    """Return the points nearest to places in the view's frame."""
-    rows = np.array([nearest_row(scene.points, place) for place in places], dtype=np.int32)
+    """Return the points nearest to places in the view's frame, each several times: crops around it are drawn anew."""
+    nearest = np.array([nearest_row(scene.points, place) for place in places], dtype=np.int32)
+    rows = np.repeat(nearest, _TRIES)
     padding = -len(rows) % NUM_SEEDS
     return Seeds(jnp.asarray(np.pad(rows, (0, padding))), jnp.arange(len(rows) + padding) < len(rows))
 
@@ -159,7 +163,7 @@ def improved(
     rows = np.pad(chosen, (0, slots - count), mode="edge")
     crop = found.crop[rows]
     surfels, sight, arrays = surfels_of(part), sight_of(scene), arrays_of(model, part)
-    turns, is_other = main_turns(part)
+    turns, is_rival = main_turns(part)
     poses, there = improve(
         jnp.asarray(found.T_view_object[rows]),
         jnp.arange(slots) < count,
@@ -168,7 +172,7 @@ def improved(
         sight,
         surfels,
         jnp.asarray(turns),
-        jnp.asarray(is_other),
+        jnp.asarray(is_rival),
         jnp.float32(part.diameter),
         jax.random.key(seed),
         config.improve,

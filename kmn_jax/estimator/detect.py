@@ -11,6 +11,7 @@ from kmn_jax.checks import InputError
 from kmn_jax.data.symmetry import Symmetries
 from kmn_jax.estimator.calibrate import Calibration, Probabilities
 from kmn_jax.estimator.candidates import (
+    NUM_SEEDS,
     CandidateConfig,
     Candidates,
     Solver,
@@ -26,13 +27,16 @@ from kmn_jax.estimator.frames import into, placed
 from kmn_jax.estimator.part import Part
 from kmn_jax.estimator.result import Detection, Detections
 from kmn_jax.estimator.scene import Scene
-from kmn_jax.estimator.select import SelectConfig, Selection, select
+from kmn_jax.estimator.select import SelectConfig, Selection, same_place, select
 from kmn_jax.estimator.timing import Clock
 from kmn_jax.models import Model
 
 _SHARES = ("explained", "violated", "occluded", "unknown")
 _LEAST_CROWD = 16  # points of a cell: fewer make no crop
 _COVER_POINTS = 1024  # on a part's surface
+_CLOSE_GAP = 0.05  # of probabilities
+_SYMMETRIC = "the part is symmetric: of the poses that look the same, this is the canonical one"
+_RIVALLED = "another pose in this place is nearly as probable: the part may lie the other way round"
 
 
 @dataclass(frozen=True)
@@ -41,19 +45,23 @@ class DetectConfig:
 
     candidates: CandidateConfig = field(default_factory=CandidateConfig)
     select: SelectConfig = field(default_factory=SelectConfig)
-    rounds: int = 8  # at most; each spreads seeds over what no seed is near and no found pose explains
+    later_seeds: int = 16  # at most in a round after the first; rounds go on until the foreground is covered
+    most_seeds: int = 512  # at least so many are searched before it is given up to cover the foreground
     accepted: float = 0.5  # the probability from which on a pose explains points, and counts as found
     reported: float = 0.1  # less probable poses are left out
     considered: int = 128  # most probable poses that are compared with each other
-    explained: float = 0.05  # points so near to the surface of a found part need no other one
+    explained: float = 0.05  # points so near to the surface of a found part are covered
+    searched: float = 0.2  # those so near to a seed
 
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
-        if self.rounds < 1 or not 0 <= self.reported <= self.accepted <= 1 or not self.explained > 0:
+        if min(self.later_seeds, self.most_seeds) < 1 or not 0 <= self.reported <= self.accepted <= 1:
             raise InputError(
-                f"rounds = {self.rounds} must be at least 1, reported = {self.reported} and accepted = {self.accepted}"
-                f" probabilities in this order, and explained = {self.explained} above zero"
+                f"later_seeds = {self.later_seeds} and most_seeds = {self.most_seeds} must be at least 1, and reported"
+                f" = {self.reported} and accepted = {self.accepted} probabilities in this order"
             )
+        if not min(self.explained, self.searched) > 0:
+            raise InputError(f"explained = {self.explained} and searched = {self.searched} must be above zero")
 
 
 def detect(
@@ -74,18 +82,25 @@ def detect(
     """
     clock = clock or Clock()
     rounds: list[Candidates] = []
-    free = scene.foreground
+    warnings, free = scene.warnings, scene.foreground
     while True:
         with clock("search"):
-            seeds = seeds_over(scene, free, part, config.candidates) if at is None else seeds_at(scene, at)
+            most = config.later_seeds if rounds else NUM_SEEDS
+            seeds = seeds_over(scene, free, part, config.candidates, most) if at is None else seeds_at(scene, at)
             rounds.append(find_candidates(model, part, scene, seeds, seed + len(rounds), config.candidates, solver))
-        if at is not None or len(rounds) == config.rounds:
+        if at is not None:
             break
         with clock("coverage"):
             last = rounds[-1]
-            likely = last.usable & (probabilities.found.probability(last.evidence) >= config.accepted)
-            free = _uncovered(scene, free, part, last, likely, config)
+            probability = probabilities.found.probability(last.evidence)
+            likely = last.usable & (probability >= config.accepted)
+            poses = _one_a_place(last, np.where(likely, probability, 0), part, same_place(part, config.select))
+            free = _uncovered(scene, free, part, last, poses, config)
         if not free.any():
+            break
+        if sum(len(found.searched.rows) for found in rounds) >= config.most_seeds:
+            left = free.sum() / scene.foreground.sum()
+            warnings = (*warnings, f"{left:.0%} of the foreground was not searched: narrow it down to where parts are")
             break
     with clock("selection"):
         joined = join(rounds)
@@ -103,8 +118,8 @@ def detect(
             for row in np.flatnonzero(choice.kept).tolist()
         ]
         found.sort(key=lambda pose: -pose.probability * pose.visible_fraction)
-    reason = None if found else _reason(joined, part)
-    return Detections(part.name, scene.unit, tuple(found), clock.timing, reason, scene.warnings)
+    reason = None if found else "; ".join(filter(None, (_reason(joined, part), scene.doubt)))
+    return Detections(part.name, scene.unit, tuple(found), clock.timing, reason, warnings)
 
 
 def _selected(found: Candidates, calibration: Calibration, part: Part, config: DetectConfig) -> Selection:
@@ -122,37 +137,36 @@ def _uncovered(
     free: Bool[np.ndarray, " r"],
     part: Part,
     found: Candidates,
-    likely: Bool[np.ndarray, " s"],
+    poses: list[int],
     config: DetectConfig,
 ) -> Bool[np.ndarray, " r"]:
     """Return the free points that no searched seed is near to and no likely pose explains, but for stray ones."""
     from scipy.spatial import cKDTree
 
     rows = np.flatnonzero(free)
-    spacing = config.candidates.seed_spacing * part.diameter
     searched = cKDTree(np.asarray(found.searched.crops.seed))
-    near, _ = searched.query(scene.points[rows], distance_upper_bound=spacing / 2)
+    near, _ = searched.query(scene.points[rows], distance_upper_bound=config.searched * part.diameter)
     rows = rows[~np.isfinite(near)]
     size = min(len(part.points), _COVER_POINTS)
     surface, reach = cKDTree(part.points[:size]), config.explained * part.diameter + float(np.sqrt(part.area / size))
-    for row in _one_a_place(found, likely, part, config.select.same_pose):
+    for row in poses:
         local = into(found.T_view_object[row].astype(np.float64), scene.points[rows])
         inside = np.flatnonzero(((local >= part.minimum - reach) & (local <= part.maximum + reach)).all(axis=1))
         distance, _ = surface.query(local[inside], distance_upper_bound=reach)
         rows = np.delete(rows, inside[np.isfinite(distance)])
-    cells = np.floor(scene.points[rows] / spacing).astype(np.int64)
+    cells = np.floor(scene.points[rows] / (config.candidates.seed_spacing * part.diameter)).astype(np.int64)
     _, which, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     result = np.zeros_like(free)
     result[rows[counts[which.reshape(-1)] >= _LEAST_CROWD]] = True
     return result
 
 
-def _one_a_place(found: Candidates, likely: Bool[np.ndarray, " s"], part: Part, reach: float) -> list[int]:
-    """Return rows of likely candidates whose centres are apart."""
+def _one_a_place(found: Candidates, score: Float[np.ndarray, " s"], part: Part, reach: float) -> list[int]:
+    """Return rows of the best candidates whose centres are apart; scores of zero do not count."""
     centers = (found.T_view_object @ np.append((part.minimum + part.maximum) / 2, 1))[:, :3]
     chosen: list[int] = []
-    for row in np.flatnonzero(likely).tolist():
-        if all(np.linalg.norm(centers[row] - centers[other]) > reach * part.diameter for other in chosen):
+    for row in np.argsort(-score, kind="stable")[: int((score > 0).sum())].tolist():
+        if (np.linalg.norm(centers[chosen] - centers[row], axis=1) > reach).all():
             chosen.append(row)
     return chosen
 
@@ -171,9 +185,9 @@ def _detection(row: int, probability: float, gap: float, found: Candidates, part
         runner_up_gap=gap,
         seed=placed(T_scene_view, np.asarray(found.searched.crops.seed[found.crop[row]])),
         prediction=replace(prediction, points=placed(T_scene_view, prediction.points).astype(np.float32)),
-        warnings=("the part is symmetric: of the poses that look the same, this is the canonical one",)
-        if part.is_symmetric
-        else (),
+        warnings=tuple(
+            text for text, holds in ((_SYMMETRIC, part.is_symmetric), (_RIVALLED, gap < _CLOSE_GAP)) if holds
+        ),
         **shares,
     )
 
@@ -216,5 +230,6 @@ def _orthonormal(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]
 def _reason(found: Candidates, part: Part) -> str:
     """Say why nothing is reported."""
     if not found.usable.any():
-        return f"no pose of {part.name} agrees with any of the {len(found.usable)} places that were searched"
+        places = len(np.unique(found.searched.rows))
+        return f"no pose of {part.name} agrees with any of the {places} places that were searched"
     return f"none of the {int(found.usable.sum())} poses that were found is probable: {part.name} may not be there"

@@ -16,14 +16,14 @@ from kmn_jax.data.cad import ObjectConfig, ObjectModel, load_object, object_from
 from kmn_jax.data.foreground import ForegroundOptions, foreground
 from kmn_jax.data.mesh_files import check_unit
 from kmn_jax.data.scan_files import Scan, read_scan
-from kmn_jax.data.units import length_problem, scene_size
+from kmn_jax.data.units import length_doubt, length_problem, scene_size
 from kmn_jax.estimator.calibrate import Probabilities, load_probabilities
 from kmn_jax.estimator.detect import DetectConfig, detect
 from kmn_jax.estimator.evidence import EVIDENCE
 from kmn_jax.estimator.frames import into
 from kmn_jax.estimator.part import Part, load_part, make_part, model_digest
 from kmn_jax.estimator.result import Detections
-from kmn_jax.estimator.scene import Scene, make_scene
+from kmn_jax.estimator.scene import Scene, make_scene, nearest_row
 from kmn_jax.estimator.timing import Clock
 from kmn_jax.estimator.view import View, view_of
 from kmn_jax.models import Model, load_model, released_file
@@ -34,6 +34,7 @@ ScanSource: TypeAlias = str | Path | np.ndarray | Scan
 _UNFITTED = "the probabilities were fitted for other weights: fit them with experiments.calibrate"
 _NUM_POINTS = 4096  # on a part's surface
 _CARD = ".kmn"
+_SEEDS = 2**31 - 2**16  # rounds of a search count on from the seed
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,13 @@ class PoseEstimator:
         in it.
         """
         if isinstance(source, str | Path) and Path(source).suffix.lower() == _CARD:
-            return load_part(source, self.digest)
+            part = load_part(source, self.digest)
+            if unit is not None and check_unit(unit) != part.unit:
+                raise InputError(
+                    f"{source} says that its lengths are {part.unit}, not {unit}: make the card again with kmn prepare"
+                    " --units"
+                )
+            return part
         return make_part(_object(source, unit, name), self.model, self.digest)
 
     def scene(
@@ -94,15 +101,19 @@ class PoseEstimator:
         foreground.
         """
         read = _scan(scan, unit or part.unit, camera)
-        problem = length_problem(part.diameter, part.unit, scene_size(read))
+        size = scene_size(read)
+        problem = length_problem(part.diameter, part.unit, size)
         if problem is not None:
             raise InputError(problem)
+        if sensor is not None and read.camera is not None:
+            raise InputError("a depth image is in the frame of its sensor: leave the sensor's place out")
         view = view_of(read, sensor)
         diameter = part.in_unit(read.unit).diameter
         front, warnings = _foreground(read, view, diameter, background or ForegroundOptions())
         places = None if at is None else into(view.T_scene_view, at)
         most = self.config.candidates.most_points
-        return make_scene(view, read.unit, front, most, places, (*self.warnings, *warnings))
+        scene = make_scene(view, read.unit, front, most, places, (*self.warnings, *warnings))
+        return replace(scene, doubt=length_doubt(part.diameter, part.unit, size))
 
     @overload
     def detect(self, part: Part, scan: ScanSource | Scene, **options: Any) -> Detections: ...
@@ -134,6 +145,8 @@ class PoseEstimator:
         for one in parts:
             if one.model_digest != self.digest:
                 raise InputError(f"the part {one.name} was prepared with other weights: prepare it with this estimator")
+        if not 0 <= seed < _SEEDS:
+            raise InputError(f"seed is {seed}, but must be between 0 and {_SEEDS - 1}")
         clock = clock or Clock()
         places = None if at is None else np.asarray(float_array(np.atleast_2d(at), "at", (None, 3)), dtype=float)
         if isinstance(scan, Scene):
@@ -143,6 +156,9 @@ class PoseEstimator:
                 smallest = min(parts, key=lambda one: one.in_unit("m").diameter)
                 scene = self.scene(scan, smallest, at=places, **options)
         in_view = None if places is None else into(scene.view.T_scene_view, places)
+        if in_view is not None:
+            reach = max(one.in_unit(scene.unit).diameter for one in parts)
+            _check_near(scene, in_view, reach)
         results = []
         for one in parts:
             found = detect(
@@ -182,6 +198,17 @@ class PoseEstimator:
                 raise InputError("crop is empty: at least one point is needed")
             results.append(self.detect(part, points, seed=seed, at=points[:1], top=1, unit=unit, background=keep_all))
         return results[0] if single else tuple(results)
+
+
+def _check_near(scene: Scene, places: Float[np.ndarray, "k 3"], reach: float) -> None:
+    """Raise InputError if nothing was measured near to one of the places, which are in the view's frame."""
+    for number, place in enumerate(places):
+        away = float(np.linalg.norm(scene.points[nearest_row(scene.points, place)] - place))
+        if away > reach:
+            raise InputError(
+                f"place {number + 1} to search at is {away:.4g} {scene.unit} away from the nearest measured point,"
+                " farther than the part is large: give a point of the scan"
+            )
 
 
 def _foreground(

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from kmn_jax.data.splat import Intrinsics, Surfels
-from kmn_jax.estimator.search import CropFeatures, Hypotheses, PartArrays, Predictions
+from kmn_jax.estimator.contour import contour
+from kmn_jax.estimator.search import CropFeatures, Hypotheses, PartArrays, Predictions, each
 from kmn_jax.estimator.verify import VerifyConfig, agreement
 from kmn_jax.geometry import inverse, nearest, transform_points
 from kmn_jax.typing import Scalar
@@ -30,7 +31,14 @@ EVIDENCE = (
     "covered",  # share of the crop's points on the pose's surface that are on the object
     "certainty",  # mean probability of the likeliest keypoint
     "object_share",  # of the crop's points that are on the object
+    "open",  # share of the pose's outline, see `Contour`
+    "level",
+    "open_explained",  # products: an explained pose and a hidden one end differently
+    "open_occluded",
 )
+_AGAINST = {"violated", "occluded", "unknown", "sunk", "rms_error", "level"}
+# Whether more of it speaks for a pose, or against it, or either, as for a part that fills its crop or does not.
+SIGNS = {name: -1 if name in _AGAINST else 0 if name == "object_share" else 1 for name in EVIDENCE}
 _NEAR = 0.1  # diameters
 _SURFACE = 0.05  # diameters; points so near to a surface with a normal like it lie on it
 _ALIKE = 0.5  # cosine
@@ -52,12 +60,12 @@ def evidence_of(
     sight: Sight,
     config: VerifyConfig,
 ) -> Float[Array, "s h f"]:
-    """Return the evidence on each pose, in the order of EVIDENCE."""
+    """Return the evidence on each pose, in the order of EVIDENCE; zeros for crops without any pose."""
 
     def of_crop(found: Hypotheses, said: Predictions, crop: CropFeatures) -> Float[Array, "h f"]:
         return jax.lax.map(lambda pose: _evidence(pose, said, crop, part, surfels, sight, config), found)
 
-    return jax.lax.map(lambda item: of_crop(*item), (found, said, crops))
+    return each(of_crop, crops.valid & found.found.any(axis=1), found, said, crops)
 
 
 def _evidence(
@@ -69,6 +77,7 @@ def _evidence(
     sight: Sight,
     config: VerifyConfig,
 ) -> Float[Array, " f"]:
+    outline = contour(found.T_scene_object, surfels, sight.depth, sight.camera, part.diameter, config)
     seen = agreement(found.T_scene_object, surfels, sight.depth, sight.camera, part.diameter, config)
     local = transform_points(inverse(found.T_scene_object), crop.points + crop.seed[None])
     label, _ = nearest(local, part.points[: said.scores.shape[1]])
@@ -80,9 +89,12 @@ def _evidence(
     surface = crop.mask & (distance <= _SURFACE) & (cosine > _ALIKE)
     columns = {
         **seen._asdict(),
+        **outline._asdict(),
+        "open_explained": outline.open * seen.explained,
+        "open_occluded": outline.open * seen.occluded,
         "confirmed": seen.explained / jnp.maximum(seen.explained + seen.violated, 1e-6),
         "fit": _mean(near, said.on_object),
-        "rms_error": jnp.sqrt(_mean(distance**2, near)),
+        "rms_error": jnp.where(near.any(), jnp.sqrt(_mean(distance**2, near)), _NEAR),
         "inlier_share": found.inlier_share,
         "log_inliers": jnp.log1p(found.num_inliers.astype(jnp.float32)),
         "likelihood": _mean(jnp.take_along_axis(said.scores, label[:, None], axis=1)[:, 0], said.on_object),

@@ -19,7 +19,7 @@ from kmn_jax.estimator.evidence import Sight, evidence_of
 from kmn_jax.estimator.part import Part
 from kmn_jax.estimator.scene import LEAST_POINTS
 from kmn_jax.estimator.search import SceneArrays, crop_features, search
-from kmn_jax.estimator.select import distances, overlaps, symmetry_transforms
+from kmn_jax.estimator.select import distances, overlaps, same_place, symmetry_transforms
 from kmn_jax.estimator.verify import depth_buffer
 from kmn_jax.files import write_whole
 
@@ -92,7 +92,7 @@ def _program(estimator: PoseEstimator, part: Part) -> Callable[..., dict[str, Ar
         shared = overlaps(
             pairs, some, jnp.asarray(part.normals[:count]), jnp.sqrt(surfels.area / count), choice.depth * diameter
         )
-        shared = (apart <= choice.same_pose * diameter) | (shared > choice.overlap)
+        shared = (apart <= same_place(part, choice)) | (shared > choice.overlap)
         excluded = jnp.zeros((total, total), dtype=bool).at[first, second].set(shared)
         excluded = excluded | excluded.T
 

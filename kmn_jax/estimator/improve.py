@@ -29,6 +29,7 @@ from kmn_jax.typing import Points, Pose, PRNGKey, Scalar
 
 _ALIKE = 0.3  # cosine of normals, for a point that may lie on a pose's surface
 _SAME = 0.1  # diameters between points of turned and unturned parts that look the same
+_SIMILAR = 0.05  # diameters, in the mean, between the surfaces of parts that may be taken for each other
 _COMPARED = 256  # points
 
 
@@ -40,25 +41,27 @@ class ImproveConfig:
     margin: float = 0.1  # by which the depth image may speak against a turned pose before it is refined
     num_points: int = 768  # of a crop around the pose's seed
     icp_points: int = 256  # of these, near to the pose's surface
-    object_points: int = 768  # on the part's surface
+    object_points: int = 512  # on the part's surface
     reach: float = 0.1  # how near
     icp: IcpConfig = field(default_factory=lambda: IcpConfig(iterations=15))
-    rough_turns: int = 8  # the best turns as they are, which are roughly refined
+    rough_turns: int = 4  # the best turns as they are, which are roughly refined
     rough_icp: IcpConfig = field(default_factory=lambda: IcpConfig(iterations=6, distance_gate=0.2))
     rough_points: int = 128  # of the crop
     raw_tolerance: float = 0.1  # of depths, for turns as they are: the pose is not exact
     tolerance: float = 0.05  # the same, once they are roughly refined
     rough_surfels: int = 512  # by which turns are compared with the depth image and the crop
     normal_radius: float = 0.06
-    normal_points: int = 4096
+    normal_points: int = 2048
 
 
 def main_turns(part: Part) -> tuple[Float32[np.ndarray, "v 4 4"], Bool[np.ndarray, " v"]]:
     """Return the 23 turns that map the part's main axes onto each other, about the centroid of its surface.
 
     These axes are those of its frame, or of its moments, whichever box along them is smaller.
-    The flags are false for those under which the part looks the same.
+    The flags are false for those under which the part looks the same, or not at all like itself.
     """
+    from scipy.spatial import cKDTree
+
     points = part.points.astype(np.float64)
     center = points.mean(axis=0)
     moments = np.linalg.svd(points - center, full_matrices=False)[2]
@@ -74,7 +77,9 @@ def main_turns(part: Part) -> tuple[Float32[np.ndarray, "v 4 4"], Bool[np.ndarra
             turns.append(pose)
     poses = np.array(turns, dtype=np.float32)
     moved = _moved(jnp.asarray(poses), jnp.asarray(part.points[:_COMPARED]), padded_symmetries(part))
-    return poses, np.asarray(moved) > _SAME * part.diameter
+    surface, some = cKDTree(points), points[:_COMPARED]
+    apart = [surface.query(some @ pose[:3, :3].T + pose[:3, 3])[0].mean() for pose in turns]
+    return poses, (np.asarray(moved) > _SAME * part.diameter) & (np.array(apart) <= _SIMILAR * part.diameter)
 
 
 @jax.jit
@@ -91,7 +96,7 @@ def improve(
     sight: Sight,
     surfels: Surfels,
     turns: Float[Array, "v 4 4"],
-    is_other: Bool[Array, " v"],
+    is_rival: Bool[Array, " v"],
     diameter: Scalar,
     key: PRNGKey,
     config: ImproveConfig,
@@ -138,11 +143,20 @@ def improve(
             return fine.T_scene_object
 
         turned = jax.lax.map(lambda turn: compose(pose, turn), turns)
-        raw = jnp.where(is_other, jax.lax.map(lambda pose: score(pose, config.raw_tolerance), turned), -jnp.inf)
-        hope, rows = jax.lax.top_k(raw, config.rough_turns)
-        rough = jax.lax.map(lambda start: refined(start, few, config.rough_points, config.rough_icp), turned[rows])
-        scores = jax.lax.map(lambda pose: score(pose, config.tolerance), rough)
-        scores = jnp.where(jnp.isfinite(hope), scores, -jnp.inf)
+        unlikely = jnp.float32(-jnp.inf)
+
+        def raw_score(turned: Pose, is_rival: Bool[Array, ""]) -> Scalar:
+            return jax.lax.cond(is_rival, lambda: score(turned, config.raw_tolerance), lambda: unlikely)
+
+        def roughly_refined(start: Pose, is_rival: Bool[Array, ""]) -> tuple[Pose, Scalar]:
+            def both() -> tuple[Pose, Scalar]:
+                rough = refined(start, few, config.rough_points, config.rough_icp)
+                return rough, score(rough, config.tolerance)
+
+            return jax.lax.cond(is_rival, both, lambda: (start, unlikely))
+
+        hope, rows = jax.lax.top_k(jax.lax.map(lambda item: raw_score(*item), (turned, is_rival)), config.rough_turns)
+        rough, scores = jax.lax.map(lambda item: roughly_refined(*item), (turned[rows], jnp.isfinite(hope)))
         best, rows = jax.lax.top_k(scores, config.alternatives)
         there = jnp.concatenate([jnp.ones(1, dtype=bool), best >= score(pose, config.tolerance) - config.margin])
         starts = jnp.concatenate([pose[None], rough[rows]])

@@ -153,7 +153,8 @@ def load_part(path: str | Path, digest: str | None = None) -> Part:
         raise InputError(f"{path} is a damaged object card ({error}): make it again with kmn prepare") from None
     if digest is not None and part.model_digest != digest:
         raise InputError(
-            f"{path} was made by other weights than those in use: make it again with kmn prepare CAD_FILE -o {path}"
+            f"{path} was made by other weights than those in use: make it again with kmn prepare CAD_FILE -o {path},"
+            " and with the same --weights"
         )
     return part
 

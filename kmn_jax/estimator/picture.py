@@ -41,6 +41,12 @@ _IN_FRONT = 0.05  # of the diameter: what was measured that much nearer hides a 
 _DASH = 7  # pixels of the outlines of unlikely poses
 
 
+def check_picture(path: str | Path) -> None:
+    """Raise InputError for a path that is not that of a PNG file."""
+    if Path(path).suffix.lower() != ".png":
+        raise InputError(f"{path} cannot be written: pictures are PNG files, name one that ends with .png")
+
+
 def save_picture(
     path: str | Path,
     view: View,
@@ -54,8 +60,7 @@ def save_picture(
     without poses makes a picture that says why. Raises InputError if the path is no PNG file's or cannot be written
     to, or if matplotlib is not installed.
     """
-    if Path(path).suffix.lower() != ".png":
-        raise InputError(f"{path} cannot be written: pictures are PNG files, name one that ends with .png")
+    check_picture(path)
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure

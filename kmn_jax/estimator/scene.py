@@ -28,6 +28,7 @@ class Scene:
     arrays: SceneArrays  # the same, padded
     depth: Float[Array, "h w"]  # the view's, padded
     warnings: tuple[str, ...] = ()
+    doubt: str | None = None  # about its unit, told if nothing is found
     features: dict[tuple[object, ...], CropFeatures] = field(default_factory=dict)
 
 

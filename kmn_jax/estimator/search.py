@@ -26,10 +26,10 @@ class SearchConfig:
     """How poses are searched around a seed; lengths are shares of the object's diameter."""
 
     matches: MatchConfig = field(default_factory=lambda: MatchConfig(capacity=1024))
-    ransac: RansacConfig = field(default_factory=RansacConfig)
+    ransac: RansacConfig = field(default_factory=lambda: RansacConfig(num_hypotheses=500, num_candidates=8192))
     num_modes: int = 3  # poses of a crop that are refined
-    icp: IcpConfig = field(default_factory=lambda: IcpConfig(iterations=12))
-    icp_points: int = 256  # of a crop, on the object
+    icp: IcpConfig = field(default_factory=lambda: IcpConfig(iterations=6))
+    icp_points: int = 128  # of a crop, on the object
     normal_radius: float = 0.06
     normal_points: int = 4096  # drawn around a seed for normals; the network's number of them is the crop
 

@@ -19,6 +19,7 @@ from kmn_jax.typing import Normals, Points, Scalar
 
 _PAIRS = 64  # that are compared in one call: one number, so one compilation
 _ALIKE = 0.5  # cosine of normals
+_BREADTHS = 0.5  # of a part, between poses of one copy
 _TURNS = 36  # of a continuous symmetry: 10 degrees, under which poses count as the same anyway
 
 
@@ -26,11 +27,17 @@ _TURNS = 36  # of a continuous symmetry: 10 degrees, under which poses count as 
 class SelectConfig:
     """Set the selection; lengths are shares of the object's diameter."""
 
-    same_pose: float = 0.2  # poses whose surfaces are nowhere further apart are one
+    same_pose: float = 0.2  # poses whose surfaces are nowhere further apart are one, see `same_place`
     depth: float = 0.05  # a point so far below another part's surface is inside of it
     overlap: float = 0.15  # share of a part's points that may be inside of another part, or on the same surface
-    contest: float = 0.2  # difference of scores up to which another pose may turn out to be better
+    contest: float = 0.1  # difference of scores up to which another pose may turn out to be better
     num_points: int = 128  # on the surface, that are compared
+
+
+def same_place(part: Part, config: SelectConfig) -> float:
+    """Return how far apart poses of one copy may be: less than slender parts that lie side by side are."""
+    breadth = float(np.sort(part.maximum - part.minimum)[1])
+    return min(config.same_pose * part.diameter, _BREADTHS * breadth)
 
 
 def symmetry_transforms(symmetries: Symmetries) -> Float[np.ndarray, "t 4 4"]:
@@ -118,12 +125,13 @@ def select(
     points, normals = (jnp.asarray(array[: config.num_points]) for array in (part.points, part.normals))
     centers = (poses @ np.append(part.points.mean(axis=0), 1))[:, :3]
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+    reach = same_place(part, config)
     # The mean of the points moves no farther than the farthest of them.
     symmetries = padded_symmetries(part)
     same = _related(
         poses,
-        (apart <= config.same_pose * part.diameter) & usable[:, None] & usable[None],
-        lambda pairs: distances(pairs, points, symmetries) <= config.same_pose * part.diameter,
+        (apart <= reach) & usable[:, None] & usable[None],
+        lambda pairs: distances(pairs, points, symmetries) <= reach,
     )
     one_each = accept(score, usable, same)
     depth = jnp.float32(config.depth * part.diameter)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.bop import BopDataset
-from kmn_jax.data.bop_scans import bop_scan, is_bop_image
+from kmn_jax.data.bop_scans import bop_scan, bop_scene_id, bop_sizes, is_bop_image
 from tests.data.bop_sample import edit_json, sample_frame, save_image, write_blenderproc, write_sample
 
 
@@ -78,6 +79,22 @@ def test_a_scene_folder_is_enough_and_paths_may_be_relative(image: Path, monkeyp
     monkeypatch.chdir(scene / "depth")
     assert is_bop_image(image.name)
     assert len(bop_scan(image.name)[0].points) > 1000
+    assert bop_scene_id(image.name) == 0
+
+
+def test_scene_and_objects_of_a_dataset(image: Path) -> None:
+    assert bop_scene_id(image) == int(image.parents[1].name)
+    infos = image.parents[3] / "models" / "models_info.json"
+    found = bop_sizes(image)
+    assert found
+    for key, info in json.loads(infos.read_text()).items():
+        assert found[int(key)][0] == info["diameter"]
+        assert found[int(key)][1] == min(info[name] for name in ("size_x", "size_y", "size_z"))
+    for content in ("{", "[]", '{"1": {}}'):
+        infos.write_text(content)
+        assert bop_sizes(image) == {}
+    infos.unlink()
+    assert bop_sizes(image) == {}
 
 
 def test_other_images_are_none_of_a_bop_scene(image: Path) -> None:

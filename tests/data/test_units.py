@@ -10,7 +10,7 @@ import pytest
 from kmn_jax.checks import InputError
 from kmn_jax.data.mesh_files import METRES
 from kmn_jax.data.scan_files import DepthCamera, Scan, depth_scan
-from kmn_jax.data.units import SceneSize, length_problem, resolve_unit, scene_size
+from kmn_jax.data.units import SceneSize, length_doubt, length_problem, resolve_unit, scene_size
 
 # In mm: the object's diameter; the scene's extent, spacing and distance.
 MOTOR = (60.0, 500.0, 0.6, 700.0)  # in a bin of 400 x 300
@@ -73,6 +73,13 @@ def test_the_sentence_as_a_whole() -> None:
         "the object of 2.36 mm is far too small for the scene of 500 mm: the object would fit 25.4 times larger, so its"
         " lengths are probably inches (centimetres for the object would fit, too): say --object-units in"
     )
+
+
+def test_a_more_usual_unit_is_told_where_nothing_is_found() -> None:
+    assert length_doubt(60.0, "mm", scene(MOTOR, "mm")) is None
+    tenth = scene(MOTOR, "cm", "mm")
+    assert length_problem(60.0, "mm", tenth) is None
+    assert length_doubt(60.0, "mm", tenth) == "if the scan's lengths are inches, not millimetres, say --units in"
 
 
 @pytest.mark.parametrize(

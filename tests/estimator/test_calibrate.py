@@ -47,6 +47,16 @@ def test_a_weight_counts_a_pose_several_times() -> None:
     np.testing.assert_allclose(weighted.probability(evidence), repeated.probability(evidence), atol=0.01)
 
 
+def test_a_column_speaks_only_the_way_it_may() -> None:
+    evidence, right = drawn(2_000)
+    free = fit_calibration(evidence, right, NAMES)
+    allowed = fit_calibration(evidence, right, NAMES, signs={"first": 1, "second": -1})
+    np.testing.assert_allclose(allowed.probability(evidence), free.probability(evidence), atol=1e-4)
+    forbidden = fit_calibration(evidence, right, NAMES, signs={"first": -1, "second": -1})
+    assert forbidden.weights[0] == 0
+    assert forbidden.weights[1] < 0
+
+
 def test_evidence_that_decides_completely_keeps_finite_weights() -> None:
     evidence = np.array([[0.0], [0.1], [0.9], [1.0]], dtype=np.float32)
     fitted = fit_calibration(evidence, np.array([False, False, True, True]), ("only",))

@@ -14,7 +14,7 @@ from kmn_jax.checks import InputError
 from kmn_jax.data.bop_scans import bop_scan
 from kmn_jax.data.foreground import ForegroundOptions
 from kmn_jax.data.scan_files import Scan
-from kmn_jax.estimator import DetectConfig, Part, PoseEstimator, as_json, table
+from kmn_jax.estimator import DetectConfig, Part, PoseEstimator, as_json, save_part, table
 from kmn_jax.estimator.candidates import Seeds, find_candidates, seeds_over
 from kmn_jax.estimator.detect import canonical_pose
 from kmn_jax.estimator.evidence import EVIDENCE
@@ -128,9 +128,9 @@ def test_seeds_are_spread_and_the_others_not_searched(estimator: PoseEstimator, 
     scene = estimator.scene(scan, motor)
     config = DetectConfig().candidates
     seeds = seeds_over(scene, scene.foreground, motor, config)
-    few = Seeds(seeds.rows, seeds.real & (jnp.arange(len(seeds.real)) < 4))
+    few = Seeds(seeds.rows, seeds.real & (jnp.arange(len(seeds.real)) < 16))
     found = find_candidates(estimator.model, motor, scene, few, 0, config)
-    assert found.evidence.shape == (4 * config.search.num_modes, len(EVIDENCE))
+    assert found.evidence.shape == (16 * config.search.num_modes, len(EVIDENCE))
     assert np.isfinite(found.evidence).all()
     right = [errors(pose, truth, motor).min() < 0.1 for pose in found.T_view_object[found.usable]]
     assert np.mean(right) > 0.3
@@ -151,7 +151,7 @@ def test_a_symmetric_part_has_one_canonical_pose(estimator: PoseEstimator, mesh:
     assert np.trace(chosen[:3, :3]) >= np.trace(base[:3, :3]) - 1e-9
 
 
-def test_what_cannot_be_is_one_sentence(estimator: PoseEstimator, motor: Part) -> None:
+def test_what_cannot_be_is_one_sentence(estimator: PoseEstimator, motor: Part, tmp_path: Path) -> None:
     scan, _ = bin_of(0)
     with pytest.raises(InputError, match=r"say --units|metres"):
         estimator.detect(motor, scan.points, unit="m")
@@ -165,6 +165,16 @@ def test_what_cannot_be_is_one_sentence(estimator: PoseEstimator, motor: Part) -
         estimator.prepare({})
     with pytest.raises(InputError, match="must be \\(n, 3\\)"):
         estimator.prepare(np.zeros((5, 2)))
+    with pytest.raises(InputError, match="seed is -1, but must be between 0"):
+        estimator.detect(motor, scan, seed=-1)
+    with pytest.raises(InputError, match=r"place 2 to search at is .* mm away from the nearest measured point"):
+        estimator.detect(motor, scan, at=np.stack([scan.points[0], [9000.0, 0, 0]]))
+    with pytest.raises(InputError, match="leave the sensor's place out"):
+        estimator.detect(motor, scan, sensor=np.zeros(3))
+    save_part(motor, tmp_path / "motor.kmn")
+    assert estimator.prepare(tmp_path / "motor.kmn", "mm").unit == "mm"
+    with pytest.raises(InputError, match="says that its lengths are mm, not m: make the card again"):
+        estimator.prepare(tmp_path / "motor.kmn", "m")
     with pytest.raises(InputError, match="there is no released model"):
         PoseEstimator.from_pretrained("none")
 
@@ -180,6 +190,11 @@ def test_a_scan_without_the_part_is_an_empty_or_doubtful_result(estimator: PoseE
         motor, wavy[:30].astype(np.float32), unit="mm", background=ForegroundOptions(remove_plane="never")
     )
     assert not any(pose.probability >= 0.5 for pose in few.poses)
+    scene = replace(estimator.scene(wavy.astype(np.float32), motor, unit="mm"), doubt="say --units cm")
+    strict = replace(estimator, config=DetectConfig(reported=0.99, accepted=0.99))
+    reason = strict.detect(motor, scene, at=wavy[:2]).reason
+    assert reason is not None
+    assert reason.endswith("; say --units cm")
 
 
 def test_an_exported_estimator_finds_the_same_without_this_package(

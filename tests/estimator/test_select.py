@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +15,7 @@ from kmn_jax.estimator.select import (
     accept,
     distances,
     overlaps,
+    same_place,
     select,
     symmetry_transforms,
 )
@@ -84,6 +87,25 @@ def test_the_best_of_what_excludes_each_other_is_taken() -> None:
         excluded[one, other] = excluded[other, one] = True
     np.testing.assert_array_equal(accept(score, usable, excluded), [False, True, True, False, False])
     np.testing.assert_array_equal(accept(score * 0, usable, excluded), [True, False, True, False, False])
+
+
+def test_slender_parts_side_by_side_are_two() -> None:
+    x, y, z = BOX.maximum - BOX.minimum
+    assert same_place(BOX, SelectConfig()) == pytest.approx(min(0.2 * BOX.diameter, sorted((x, y, z))[1] / 2))
+    along, angle = np.linspace(-0.5, 0.5, 256), np.arange(256) * 2.4
+    round_ = np.stack([np.zeros(256), np.cos(angle), np.sin(angle)], axis=1)
+    low = np.array([-0.5, -0.075, -0.075])
+    rod = replace(
+        BOX,
+        points=(0.075 * round_ + along[:, None] * [1, 0, 0]).astype(np.float32),
+        normals=round_.astype(np.float32),
+        minimum=low,
+        maximum=-low,
+        diameter=1.01,
+        area=0.47,
+    )
+    poses = np.stack([moved(0, 0.16 * row, 0) for row in range(3)]).astype(np.float32)
+    assert select(poses, np.array([0.9, 0.8, 0.7]), np.ones(3, dtype=bool), rod, SelectConfig()).kept.all()
 
 
 @pytest.mark.parametrize("first", [0, 1])

@@ -22,11 +22,22 @@ def box(*extents: float) -> Mesh:
 def bracket() -> Mesh:
     """Return a thick L of about unit diagonal, which hides parts of itself; wound outwards."""
     outline = np.array([[0, 0], [0.8, 0], [0.8, 0.6], [0.65, 0.6], [0.65, 0.15], [0, 0.15]]) - [0.4, 0.2]
+    return _prism(outline, [[0, 1, 4], [0, 4, 5], [1, 2, 3], [1, 3, 4]])
+
+
+def notched_box() -> Mesh:
+    """Return a box of about unit diagonal without one of its edges: turned by halves it looks nearly the same."""
+    outline = np.array([[0, 0], [0.8, 0], [0.8, 0.4], [0.65, 0.4], [0.65, 0.55], [0, 0.55]]) - [0.4, 0.275]
+    return _prism(outline, [[3, 4, 5], [3, 5, 0], [3, 0, 1], [3, 1, 2]])
+
+
+def _prism(outline: np.ndarray, cap: list[list[int]]) -> Mesh:
+    """Return a hexagon in x and z with the triangles of its face, 0.3 thick along y."""
     sides = [np.column_stack([outline[:, 0], np.full(6, y), outline[:, 1]]) for y in (-0.15, 0.15)]
-    cap = np.array([[0, 1, 4], [0, 4, 5], [1, 2, 3], [1, 3, 4]])
+    front = np.array(cap)
     here, after = np.arange(6), (np.arange(6) + 1) % 6
     walls = [np.column_stack([after, here, here + 6]), np.column_stack([after, here + 6, after + 6])]
-    return np.concatenate(sides), np.concatenate([cap, cap[:, ::-1] + 6, *walls]).astype(np.int32)
+    return np.concatenate(sides), np.concatenate([front, front[:, ::-1] + 6, *walls]).astype(np.int32)
 
 
 def square(side: float) -> Mesh:

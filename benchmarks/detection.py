@@ -1,0 +1,78 @@
+"""Whole bins from a scan to ranked poses by the released network: seconds warm, by stage, and the first time.
+
+python -m benchmarks.detection [--folder experiments/assets/small_test_set] [--repeats 3] [--json FILE]
+
+Each image of a BOP dataset is searched as a depth image that nobody has searched before, nothing of it is kept between
+repeats: once as it is, and once with the inside of the bin as foreground, as with an empty bin for background.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from experiments.bins import bin_images
+from kmn_jax.data.scan_files import Scan
+from kmn_jax.estimator import Part, PoseEstimator
+from kmn_jax.estimator.scene import Scene
+from kmn_jax.report import print_table, write_json
+
+
+def main(
+    folder: Path = Path("experiments/assets/small_test_set"),
+    split: str = "test",
+    fewest: int = 8,
+    repeats: int = 3,
+    json: Path | None = None,
+) -> None:
+    """Time all images.
+
+    Args:
+        folder: dataset in BOP format, with a bin in each image.
+        split: the dataset's part to read.
+        fewest: copies in a bin; bins of fewer are left out.
+        repeats: timed searches of each, after a first one.
+        json: where results go.
+    """
+    estimator = PoseEstimator.from_pretrained()
+    rows = []
+    for image in tqdm(bin_images(folder, split, estimator.model), unit="image"):
+        if len(image.truth) < fewest:
+            continue
+        view = image.scene.view
+        scan = Scan(view.points, None, view.depth, view.camera, "mm")
+        for name, given in (("all that was measured", scan), ("inside of the bin", image.scene)):
+            rows.append(_row(estimator, image.part, given, repeats) | {"foreground": name, "copies": len(image.truth)})
+    order = ("foreground", "copies")
+    rows = [{key: row[key] for key in (*order, *(key for key in row if key not in order))} for row in rows]
+    print_table("Whole bins", rows)
+    write_json(json, {"bins": rows})
+
+
+def _row(estimator: PoseEstimator, part: Part, given: Scan | Scene, repeats: int) -> dict[str, Any]:
+    seconds, stages = [], []
+    for _ in range(repeats + 1):
+        if isinstance(given, Scene):
+            given.features.clear()
+        start = time.perf_counter()
+        found = estimator.detect(part, given)
+        seconds.append(time.perf_counter() - start)
+        stages.append(found.timing.stages)
+    likely = sum(pose.probability >= estimator.config.accepted for pose in found.poses)
+    names = [name for name in stages[-1] if name != "report"]
+    return {
+        "part": part.name,
+        "found": likely,
+        "first s": seconds[0],
+        "warm s": float(np.median(seconds[1:])),
+        **{name: float(np.median([one[name] for one in stages[1:]])) for name in names},
+    }
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,38 @@
+"""The reliability diagram: how often poses are right, over how probable they were said to be."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from kmn_jax.files import write_whole
+
+Row = Mapping[str, float]
+
+
+def save_reliability(tables: Mapping[str, Sequence[Row]], path: Path | None) -> None:
+    """Draw tables with the columns `probability`, `share right` and `poses`, one curve each; without a path, nothing.
+
+    Areas of the dots are as the numbers of poses.
+    """
+    if path is None:
+        return
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5, 5), layout="constrained")
+    axis = figure.add_subplot()
+    axis.plot([0, 1], [0, 1], color="grey", lw=1, ls="--", label="as often as said")
+    most = max((row["poses"] for rows in tables.values() for row in rows), default=1)
+    for name, rows in tables.items():
+        said, right = ([row[column] for row in rows] for column in ("probability", "share right"))
+        (line,) = axis.plot(said, right, lw=1.2, label=f"{name} ({sum(row['poses'] for row in rows):,} poses)")
+        axis.scatter(said, right, [10 + 200 * row["poses"] / most for row in rows], color=line.get_color(), alpha=0.6)
+    axis.set(xlabel="probability", ylabel="share right", xlim=(0, 1), ylim=(0, 1.02), aspect="equal")
+    axis.legend(loc="upper left")
+    axis.grid(alpha=0.3)
+    content = io.BytesIO()
+    FigureCanvasAgg(figure)
+    figure.savefig(content, dpi=110, metadata={"Software": None})
+    write_whole(path, content.getvalue())
