@@ -49,7 +49,7 @@ class Request:
     roi: str | None = None
     """XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX: only points inside of this box of the scene's frame can be parts."""
     plane: Literal["auto", "always", "never"] = "auto"
-    """Whether to leave out the largest plane and what is behind it; auto: if it is larger than the object."""
+    """Whether to leave out the largest plane, what is behind it, and a bin's walls; auto: if larger than the object."""
     sensor: str | None = None
     """X,Y,Z of the sensor in the scene's frame; the origin unless given."""
     weights: str = "small"

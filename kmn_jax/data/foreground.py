@@ -1,7 +1,7 @@
-"""Which points of a scan may show parts: what is left without the empty bin, outside of a box, and a floor.
+"""Which points of a scan may show parts: what is left without the empty bin, outside of a box, a floor and walls.
 
-The steps run in this order: box, empty bin, floor. A floor is the plane that holds most points; it is taken away with
-all that lies behind it, seen from the sensor at the origin.
+The steps run in this order: box, empty bin, floor, walls. A floor is the plane that holds most points; it is taken away
+with all that lies behind it, seen from the sensor at the origin. For walls see walls.py.
 """
 
 from __future__ import annotations
@@ -11,23 +11,21 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float32
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.background import away_from_empty, in_front_of_empty
 from kmn_jax.data.mesh_files import METRES
+from kmn_jax.data.planes import Plane, dominant_plane, extent
 from kmn_jax.data.scan_files import Scan
+from kmn_jax.data.walls import off_walls
 
 RemovePlane = Literal["auto", "always", "never"]
 Box = tuple[float, float, float, float, float, float]
 
-_TRIPLES = 1000  # of points, each of which may lie in the plane: one of a fifth of the points gets 8 of them
-_SAMPLE = 5000  # points by which planes are compared
-_REFINEMENTS = 3
 _BEHIND = 0.15  # share of the points: with more behind it, a plane is no floor, but the tops of parts, or a rim
 _LEFT = 0.01  # share of the points in front of a floor without which it may be the parts themselves
 _PLANES = 3  # one behind the other, among which a floor is looked for
-_CHUNK = 100  # planes at a time
 _HINT = ": if it is the floor, give a region of interest or the empty bin"
 
 
@@ -36,7 +34,8 @@ class ForegroundOptions:
     """What is known of the background. Lengths without a unit are shares of the object's diameter.
 
     `remove_plane` auto takes a floor away if it is large, holds a good share of the points and has nothing much behind
-    it, and never where an empty bin is given; always takes the largest plane away, whatever it is.
+    it, and the walls of a bin, and neither where an empty bin is given; always takes the largest plane away, whatever
+    it is, and walls.
     """
 
     background: Scan | None = None  # the empty bin, in the same frame
@@ -62,18 +61,6 @@ class ForegroundOptions:
                 raise InputError(f"{name} is {getattr(self, name)}, but must be above zero and finite")
         if not 0 < self.least_share < 1:
             raise InputError(f"least_share is {self.least_share}, but must be between 0 and 1")
-
-
-@dataclass(frozen=True)
-class Plane:
-    """Points x with normal · x = offset. The unit normal points away from the sensor at the origin: behind is above."""
-
-    normal: Float64[np.ndarray, "3"]
-    offset: float  # its distance from the sensor
-
-    def height(self, points: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
-        """Return how far points are behind the plane, below zero in front of it."""
-        return points.astype(np.float64) @ self.normal - self.offset
 
 
 def foreground(
@@ -110,6 +97,9 @@ def foreground(
                     f"all {len(chosen)} points lie in one plane or behind it: if they show parts, keep the plane"
                 )
         warnings += [warning] if warning else []
+        chosen = np.flatnonzero(kept)
+        margin, least_extent = options.plane_margin * diameter, options.least_extent * diameter
+        kept[chosen] = off_walls(scan.points[chosen], floor, margin, least_extent, options.seed)
     return kept, tuple(warnings)
 
 
@@ -146,7 +136,7 @@ def _floor(
         if options.remove_plane == "always":
             weak = f"the largest plane was taken away as asked, though it holds only {share:.0%} of the points"
             return plane, weak if share < options.least_share else None
-        if share < options.least_share or _extent(points[within]) <= options.least_extent * diameter:
+        if share < options.least_share or extent(points[within]) <= options.least_extent * diameter:
             break
         if behind <= _BEHIND and before < _LEFT:
             return None, (
@@ -160,49 +150,3 @@ def _floor(
     if options.remove_plane == "always":
         return None, "no plane was taken away, as none was found"
     return None, kept_plane and f"{kept_plane} was kept, as many lie behind it{_HINT}"
-
-
-def dominant_plane(points: Float[np.ndarray, "n 3"], margin: float, seed: int = 0) -> Plane | None:
-    """Return the plane with the most points nearer to it than `margin`, refined by all of those; None if there is none.
-
-    Planes through three random points are compared, so that the same seed gives the same plane.
-    """
-    generator = np.random.default_rng(seed)
-    if len(points) < 3:
-        return None
-    center = points.astype(np.float64).mean(axis=0)
-    everything = points.astype(np.float64) - center
-    sample = everything if len(points) <= _SAMPLE else everything[generator.integers(0, len(points), _SAMPLE)]
-    corners = sample[generator.integers(0, len(sample), (_TRIPLES, 3))]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normals, axis=1)
-    proper = length > 0
-    if not proper.any():
-        return None
-    normals, corner = normals[proper] / length[proper, None], corners[proper, 0]
-    offsets = (normals * corner).sum(axis=1)
-    counts = np.concatenate(
-        [
-            (np.abs(sample @ normals[start : start + _CHUNK].T - offsets[start : start + _CHUNK]) <= margin).sum(axis=0)
-            for start in range(0, len(normals), _CHUNK)
-        ]
-    )
-    best = int(counts.argmax())
-    normal, offset = normals[best], float(offsets[best])
-    for _ in range(_REFINEMENTS):
-        inner = everything[np.abs(everything @ normal - offset) <= margin]
-        if len(inner) < 3:
-            break
-        middle = inner.mean(axis=0)
-        _, axes = np.linalg.eigh((inner - middle).T @ (inner - middle))
-        normal, offset = axes[:, 0], float(axes[:, 0] @ middle)
-    offset += float(normal @ center)
-    return Plane(normal, offset) if offset >= 0 else Plane(-normal, -offset)
-
-
-def _extent(points: Float[np.ndarray, "n 3"]) -> float:
-    """Return the longer side of what is seen of a plane, without the outermost percent of its points."""
-    offsets = points.astype(np.float64) - points.astype(np.float64).mean(axis=0)
-    axis = np.linalg.eigh(offsets.T @ offsets)[1][:, 2]
-    low, high = np.percentile(offsets @ axis, (1, 99))
-    return float(high - low)

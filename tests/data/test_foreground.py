@@ -7,7 +7,8 @@ import pytest
 from jaxtyping import Bool, Float
 
 from kmn_jax.checks import InputError
-from kmn_jax.data.foreground import ForegroundOptions, dominant_plane, foreground
+from kmn_jax.data.foreground import ForegroundOptions, foreground
+from kmn_jax.data.planes import dominant_plane
 from kmn_jax.data.scan_files import DepthCamera, Scan, depth_scan
 from kmn_jax.data.scene import Camera
 from tests.data.bop_sample import sphere_depth
