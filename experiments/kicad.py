@@ -49,7 +49,7 @@ def _extract_missing(names: list[str], cache: Path) -> None:
             " their folder with --models"
         )
     cache.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=cache) as scratch:
+    with tempfile.TemporaryDirectory(dir=cache.absolute()) as scratch:
         print(f"downloading {PACKAGE} (380 MB)", flush=True)
         _run(["apt-get", "download", "-qq", PACKAGE], scratch, f"{PACKAGE} could not be downloaded")
         package = next(Path(scratch).glob(f"{PACKAGE}_*.deb"))

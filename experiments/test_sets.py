@@ -26,6 +26,7 @@ from kmn_jax.data.raycast import RayMesh
 from kmn_jax.data.recipe import PackConfig, bin_scenes, rendered_frame
 from kmn_jax.data.sensor import PERFECT, SensorConfig
 from kmn_jax.files import write_whole
+from kmn_jax.report import processor
 
 ASSETS = Path(__file__).parent / "assets"
 DIGESTS = ASSETS / "test_sets.json"
@@ -97,7 +98,7 @@ def verdict(name: str, digest: str) -> str:
     if record["sets"].get(name) == digest:
         return "as recorded"
     differing = {key: value for key, value in made_with().items() if record["made_with"].get(key) != value}
-    reason = f"made with other versions ({differing})" if differing else "with the same versions: please report it"
+    reason = f"made with others ({differing})" if differing else "with the same versions: please report it"
     return f"differs from {DIGESTS.name}, {reason}"
 
 
@@ -119,8 +120,8 @@ def record_digests(digests: dict[str, str]) -> None:
 
 
 def made_with() -> dict[str, str]:
-    """Return what decides the last bit of a scene: library versions and processor architecture."""
-    return {"machine": platform.machine(), **{name: version(name) for name in _LIBRARIES}}
+    """Return what decides the last bit of a scene: library versions and the processor, which sums in its own order."""
+    return {"machine": platform.machine(), "processor": processor(), **{name: version(name) for name in _LIBRARIES}}
 
 
 def _model(path: Path) -> ObjectModel:
