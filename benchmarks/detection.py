@@ -1,6 +1,6 @@
 """Whole bins from a scan to ranked poses by the released network: seconds warm, by stage, and the first time.
 
-python -m benchmarks.detection [--folder experiments/assets/small_test_set] [--repeats 3] [--json FILE]
+python -m benchmarks.detection [--folders outputs/test_sets/electronics ...] [--fewest 20] [--json FILE]
 
 Each image of a BOP dataset is searched as a depth image that nobody has searched before, nothing of it is kept between
 repeats: once as it is, and once with the inside of the bin as foreground, as with an empty bin for background.
@@ -24,7 +24,7 @@ from kmn_jax.report import print_table, write_json
 
 
 def main(
-    folder: Path = Path("experiments/assets/small_test_set"),
+    folders: tuple[Path, ...] = (Path("experiments/assets/small_test_set"),),
     split: str = "test",
     fewest: int = 8,
     repeats: int = 3,
@@ -33,23 +33,23 @@ def main(
     """Time all images.
 
     Args:
-        folder: dataset in BOP format, with a bin in each image.
-        split: the dataset's part to read.
+        folders: datasets in BOP format, with a bin in each image.
+        split: the datasets' part to read.
         fewest: copies in a bin; bins of fewer are left out.
         repeats: timed searches of each, after a first one.
         json: where results go.
     """
     estimator = PoseEstimator.from_pretrained()
     rows = []
-    for image in tqdm(bin_images(folder, split, estimator.model), unit="image"):
-        if len(image.truth) < fewest:
-            continue
-        view = image.scene.view
-        scan = Scan(view.points, None, view.depth, view.camera, "mm")
-        for name, given in (("all that was measured", scan), ("inside of the bin", image.scene)):
-            rows.append(_row(estimator, image.part, given, repeats) | {"foreground": name, "copies": len(image.truth)})
-    order = ("foreground", "copies")
-    rows = [{key: row[key] for key in (*order, *(key for key in row if key not in order))} for row in rows]
+    for folder in folders:
+        for image in tqdm(bin_images(folder, split, estimator.model), unit="image", desc=folder.name):
+            if len(image.truth) < fewest:
+                continue
+            view = image.scene.view
+            scan = Scan(view.points, None, view.depth, view.camera, "mm")
+            for name, given in (("whole scan", scan), ("inside of the bin", image.scene)):
+                facts = {"bins": folder.name, "foreground": name, "copies": len(image.truth)}
+                rows.append(facts | _row(estimator, image.part, given, repeats))
     print_table("Whole bins", rows)
     write_json(json, {"bins": rows})
 

@@ -21,18 +21,24 @@ from tqdm import tqdm
 
 from experiments.bins import THRESHOLD, BinImage, bin_images
 from experiments.calibrate import SHIPPED
-from experiments.fpfh import SOLVERS
+from experiments.fpfh import fpfh_poses
 from experiments.reliability_picture import save_reliability
 from experiments.test_sets import SPLIT
 from kmn_jax.checks import InputError
 from kmn_jax.estimator.calibrate import Probabilities, expected_calibration_error, load_probabilities, reliability
-from kmn_jax.estimator.detect import DetectConfig, detect
+from kmn_jax.estimator.candidates import Solver
+from kmn_jax.estimator.detect import THOROUGH, DetectConfig, detect
 from kmn_jax.estimator.evidence import EVIDENCE
 from kmn_jax.estimator.result import Detections
 from kmn_jax.models import load_model, load_pretrained
 from kmn_jax.report import check_target, print_table, write_json
 
 LEAST_VISIBLE = 0.3
+METHODS: dict[str, tuple[Solver | None, DetectConfig]] = {
+    "kmn_jax": (None, DetectConfig()),
+    "kmn_jax, thorough": (None, THOROUGH),
+    "FPFH": (fpfh_poses, DetectConfig()),
+}
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,7 @@ class Options:
     model: Path | None = None  # .safetensors; the released model unless given
     sets: tuple[Path, ...] = (Path("outputs/test_sets/electronics"), Path("outputs/test_sets/industrial"))
     every: int = 1  # use every so many images
-    methods: tuple[str, ...] = tuple(SOLVERS)
+    methods: tuple[str, ...] = tuple(METHODS)
     calibration: Path = SHIPPED
     fpfh_calibration: Path = Path("outputs/fpfh.calibration.json")  # python -m experiments.calibrate --method FPFH
     json: Path | None = None
@@ -98,23 +104,26 @@ def run(options: Options) -> dict[str, Any]:
     """Detect, print and return the numbers."""
     for target in (options.json, options.picture):
         check_target(target)
-    unknown = [name for name in options.methods if name not in SOLVERS]
+    unknown = [name for name in options.methods if name not in METHODS]
     if unknown:
-        raise InputError(f"method {unknown[0]!r} is not known: choose among {', '.join(SOLVERS)}")
+        raise InputError(f"method {unknown[0]!r} is not known: choose among {', '.join(METHODS)}")
     model = load_pretrained() if options.model is None else load_model(options.model)
-    config = DetectConfig()
     fitted: dict[str, Probabilities] = {
-        name: load_probabilities(options.calibration if name == "kmn_jax" else options.fpfh_calibration, EVIDENCE)
+        name: load_probabilities(
+            options.calibration if METHODS[name][0] is None else options.fpfh_calibration, EVIDENCE
+        )
         for name in options.methods
     }
     tallies: dict[tuple[str, str], Tally] = defaultdict(Tally)
     for folder in options.sets:
         for image in tqdm(bin_images(folder, SPLIT, model, options.every), unit="image", desc=folder.name):
             for name in options.methods:
-                found = detect(model, fitted[name], image.part, image.scene, 0, config, solver=SOLVERS[name])
+                solver, config = METHODS[name]
+                image.scene.features.clear()  # nothing is left of the method before
+                found = detect(model, fitted[name], image.part, image.scene, 0, config, solver=solver)
                 for group in (folder.name, f"{folder.name}: {image.part.name}"):
                     tallies[group, name].add(image, found, config.accepted)
-    rows = [tally.row(*key, config.accepted) for key, tally in tallies.items()]
+    rows = [tally.row(*key, METHODS[key[1]][1].accepted) for key, tally in tallies.items()]
     total = [row for row in rows if ":" not in row["bins"]]
     print_table("Whole-bin detection", total)
     print_table("By object", [row for row in rows if ":" in row["bins"]])

@@ -50,6 +50,8 @@ class Request:
     """XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX: only points inside of this box of the scene's frame can be parts."""
     plane: Literal["auto", "always", "never"] = "auto"
     """Whether to leave out the largest plane, what is behind it, and a bin's walls; auto: if larger than the object."""
+    thorough: bool = False
+    """Search on where nothing was found, for a few more copies in a few times as long."""
     sensor: str | None = None
     """X,Y,Z of the sensor in the scene's frame; the origin unless given."""
     weights: str = "small"
@@ -203,6 +205,7 @@ class _Session:
     def __init__(self, request: Request) -> None:
         from kmn_jax.data.foreground import ForegroundOptions
         from kmn_jax.estimator import PoseEstimator
+        from kmn_jax.estimator.detect import THOROUGH
         from kmn_jax.estimator.timing import Clock
 
         places = [_numbers(text, "--at", 3) for text in request.at]
@@ -213,7 +216,7 @@ class _Session:
         self.bop_ids = (0, 0, 1)  # scene, image, object
         self._request, self._clock = request, Clock()
         with self._clock("part"):
-            self.estimator = PoseEstimator.from_pretrained(request.weights)
+            self.estimator = PoseEstimator.from_pretrained(request.weights, THOROUGH if request.thorough else None)
             self.part = self.estimator.prepare(request.object, _unit(request.object_units))
         with self._clock("scene"):
             scan = self._read(request.scene)

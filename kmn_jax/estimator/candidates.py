@@ -9,11 +9,12 @@ from typing import Any, NamedTuple, TypeAlias, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Int
+from jaxtyping import Array, Bool, Float, Float32, Int, Key
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.splat import Surfels, intrinsics
 from kmn_jax.estimator.evidence import Sight, evidence_of
+from kmn_jax.estimator.halves import in_halves
 from kmn_jax.estimator.improve import ImproveConfig, improve, main_turns
 from kmn_jax.estimator.part import Part
 from kmn_jax.estimator.result import CropPrediction
@@ -26,6 +27,7 @@ from kmn_jax.estimator.search import (
     SearchConfig,
     crop_features,
     search,
+    seed_keys,
 )
 from kmn_jax.estimator.search import spread_seeds as _spread
 from kmn_jax.estimator.verify import VerifyConfig
@@ -120,15 +122,25 @@ def find_candidates(
     The part's lengths are in the unit of the scene. The same inputs and `seed` give the same bits on one device.
     `solver` finds poses in crops by other means than the network's.
     """
-    crop_key, pose_key = jax.random.split(jax.random.key(seed))
-    crops = _crops(model, part, scene, seeds, crop_key, seed, config)
-    arrays = arrays_of(model, part)
+    key = jax.random.key(seed)
+    crop_keys, pose_keys = seed_keys(key, len(seeds.rows))
+    crops = _crops(model, part, scene, seeds, crop_keys, seed, config)
+    arrays, surfels, sight = arrays_of(model, part), surfels_of(part), sight_of(scene)
+
+    def proof_of(found: Hypotheses, said: Predictions, crops: CropFeatures) -> Float[Array, "s h f"]:
+        shown = crops._replace(features=crops.features[:, :, :0])
+        return _evidence_of(found, said, shown, arrays, surfels, sight, config=config.verify)
+
+    def poses_in(crops: CropFeatures, keys: Key[Array, " s"]) -> tuple[Hypotheses, Predictions, Float[Array, "s h f"]]:
+        found, said = search(model.graphdef, model.parameters, arrays, crops, keys, config.search)
+        return found, said, proof_of(found, said, crops)
+
     if solver is None:
-        found, said = search(model.graphdef, model.parameters, arrays, crops, pose_key, config.search)
+        found, said, proof = in_halves(poses_in, crops, pose_keys)
     else:
-        found, said = solver(part, scene, crops, pose_key)
+        found, said = solver(part, scene, crops, key)
+        proof = proof_of(found, said, crops)
     crops = crops._replace(features=crops.features[:, :, :0])
-    proof = _evidence_of(found, said, crops, arrays, surfels_of(part), sight_of(scene), config=config.verify)
     host: Any = jax.device_get((found, proof, seeds.rows, crops, said))
     real = np.flatnonzero(seeds.real)
     found, proof, *searched = jax.tree.map(lambda leaf: leaf[real], host)
@@ -164,25 +176,41 @@ def improved(
     crop = found.crop[rows]
     surfels, sight, arrays = surfels_of(part), sight_of(scene), arrays_of(model, part)
     turns, is_rival = main_turns(part)
-    poses, there = improve(
+
+    def forms_of(
+        poses: Float[Array, "k 4 4"], real: Bool[Array, " k"], seeds: Int[Array, " k"], keys: Key[Array, " k"]
+    ) -> tuple[Float[Array, "k a 4 4"], Bool[Array, "k a"]]:
+        return improve(
+            poses,
+            real,
+            seeds,
+            scene.arrays,
+            sight,
+            surfels,
+            jnp.asarray(turns),
+            jnp.asarray(is_rival),
+            jnp.float32(part.diameter),
+            keys,
+            config.improve,
+            config.verify,
+        )
+
+    poses, there = in_halves(
+        forms_of,
         jnp.asarray(found.T_view_object[rows]),
         jnp.arange(slots) < count,
         jnp.asarray(found.searched.rows[crop]),
-        scene.arrays,
-        sight,
-        surfels,
-        jnp.asarray(turns),
-        jnp.asarray(is_rival),
-        jnp.float32(part.diameter),
-        jax.random.key(seed),
-        config.improve,
-        config.verify,
+        jax.random.split(jax.random.key(seed), slots),
     )
     forms = there.shape[1]
     wide = [np.repeat(column[rows, None], forms, axis=1) for column in (found.num_inliers, found.inlier_share)]
     hypotheses = Hypotheses(poses, there, *(jnp.asarray(column) for column in wide))
     crops, said = jax.tree.map(lambda leaf: jnp.asarray(leaf[crop]), (found.searched.crops, found.searched.said))
-    proof = _evidence_of(hypotheses, said, crops, arrays, surfels, sight, config=config.verify)
+
+    def proof_of(found: Hypotheses, said: Predictions, crops: CropFeatures) -> Float[Array, "s h f"]:
+        return _evidence_of(found, said, crops, arrays, surfels, sight, config=config.verify)
+
+    proof = in_halves(proof_of, hypotheses, said, crops)
     host: Any = jax.device_get((hypotheses, proof))
 
     def flat(leaf: np.ndarray) -> np.ndarray:
@@ -218,7 +246,13 @@ def crop_prediction(found: Candidates, row: int) -> CropPrediction:
 
 
 def _crops(
-    model: Model, part: Part, scene: Scene, seeds: Seeds, key: PRNGKey, seed: int, config: CandidateConfig
+    model: Model,
+    part: Part,
+    scene: Scene,
+    seeds: Seeds,
+    keys: Key[Array, " s"],
+    seed: int,
+    config: CandidateConfig,
 ) -> CropFeatures:
     """Return the crops' features, those that the scene remembers if there are any."""
     length = _LENGTH_STEP ** round(np.log(part.diameter) / np.log(_LENGTH_STEP))
@@ -235,17 +269,21 @@ def _crops(
     if name not in scene.features:
         if len(scene.features) >= _REMEMBERED:
             scene.features.clear()
-        scene.features[name] = crop_features(
-            model.graphdef,
-            model.parameters,
-            scene.arrays,
-            seeds.rows,
-            seeds.real,
-            jnp.float32(length),
-            key,
-            config.search,
-            number,
-        )
+
+        def encoded(rows: Int[Array, " s"], real: Bool[Array, " s"], keys: Key[Array, " s"]) -> CropFeatures:
+            return crop_features(
+                model.graphdef,
+                model.parameters,
+                scene.arrays,
+                rows,
+                real,
+                jnp.float32(length),
+                keys,
+                config.search,
+                number,
+            )
+
+        scene.features[name] = in_halves(encoded, seeds.rows, seeds.real, keys)
     return scene.features[name]
 
 

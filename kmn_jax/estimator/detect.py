@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.symmetry import Symmetries
@@ -22,8 +22,9 @@ from kmn_jax.estimator.candidates import (
     seeds_at,
     seeds_over,
 )
+from kmn_jax.estimator.coverage import CoverageConfig, cover, nothing_covered, to_search
 from kmn_jax.estimator.evidence import EVIDENCE
-from kmn_jax.estimator.frames import into, placed
+from kmn_jax.estimator.frames import placed
 from kmn_jax.estimator.part import Part
 from kmn_jax.estimator.result import Detection, Detections
 from kmn_jax.estimator.scene import Scene
@@ -32,8 +33,6 @@ from kmn_jax.estimator.timing import Clock
 from kmn_jax.models import Model
 
 _SHARES = ("explained", "violated", "occluded", "unknown")
-_LEAST_CROWD = 16  # points of a cell: fewer make no crop
-_COVER_POINTS = 1024  # on a part's surface
 _CLOSE_GAP = 0.05  # of probabilities
 _SYMMETRIC = "the part is symmetric: of the poses that look the same, this is the canonical one"
 _RIVALLED = "another pose in this place is nearly as probable: the part may lie the other way round"
@@ -44,14 +43,13 @@ class DetectConfig:
     """How a scene is searched; lengths are shares of the object's diameter."""
 
     candidates: CandidateConfig = field(default_factory=CandidateConfig)
+    coverage: CoverageConfig = field(default_factory=CoverageConfig)
     select: SelectConfig = field(default_factory=SelectConfig)
     later_seeds: int = 16  # at most in a round after the first; rounds go on until the foreground is covered
     most_seeds: int = 512  # at least so many are searched before it is given up to cover the foreground
     accepted: float = 0.5  # the probability from which on a pose explains points, and counts as found
     reported: float = 0.1  # less probable poses are left out
     considered: int = 128  # most probable poses that are compared with each other
-    explained: float = 0.05  # points so near to the surface of a found part are covered
-    searched: float = 0.2  # those so near to a seed
 
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
@@ -60,8 +58,9 @@ class DetectConfig:
                 f"later_seeds = {self.later_seeds} and most_seeds = {self.most_seeds} must be at least 1, and reported"
                 f" = {self.reported} and accepted = {self.accepted} probabilities in this order"
             )
-        if not min(self.explained, self.searched) > 0:
-            raise InputError(f"explained = {self.explained} and searched = {self.searched} must be above zero")
+
+
+THOROUGH = DetectConfig(coverage=CoverageConfig(patience=None))
 
 
 def detect(
@@ -82,7 +81,7 @@ def detect(
     """
     clock = clock or Clock()
     rounds: list[Candidates] = []
-    warnings, free = scene.warnings, scene.foreground
+    warnings, free, state = scene.warnings, scene.foreground, nothing_covered(scene)
     while True:
         with clock("search"):
             most = config.later_seeds if rounds else NUM_SEEDS
@@ -94,8 +93,9 @@ def detect(
             last = rounds[-1]
             probability = probabilities.found.probability(last.evidence)
             likely = last.usable & (probability >= config.accepted)
-            poses = _one_a_place(last, np.where(likely, probability, 0), part, same_place(part, config.select))
-            free = _uncovered(scene, free, part, last, poses, config)
+            score, reach = np.where(likely, probability, 0), same_place(part, config.select)
+            state = cover(state, scene, part, last, score, reach, config.coverage)
+            free = to_search(state, scene, part, config.coverage)
         if not free.any():
             break
         if sum(len(found.searched.rows) for found in rounds) >= config.most_seeds:
@@ -130,45 +130,6 @@ def _selected(found: Candidates, calibration: Calibration, part: Part, config: D
     few = np.zeros_like(possible)
     few[ranked] = possible[ranked]
     return select(found.T_view_object, probability, few, part, config.select)
-
-
-def _uncovered(
-    scene: Scene,
-    free: Bool[np.ndarray, " r"],
-    part: Part,
-    found: Candidates,
-    poses: list[int],
-    config: DetectConfig,
-) -> Bool[np.ndarray, " r"]:
-    """Return the free points that no searched seed is near to and no likely pose explains, but for stray ones."""
-    from scipy.spatial import cKDTree
-
-    rows = np.flatnonzero(free)
-    searched = cKDTree(np.asarray(found.searched.crops.seed))
-    near, _ = searched.query(scene.points[rows], distance_upper_bound=config.searched * part.diameter)
-    rows = rows[~np.isfinite(near)]
-    size = min(len(part.points), _COVER_POINTS)
-    surface, reach = cKDTree(part.points[:size]), config.explained * part.diameter + float(np.sqrt(part.area / size))
-    for row in poses:
-        local = into(found.T_view_object[row].astype(np.float64), scene.points[rows])
-        inside = np.flatnonzero(((local >= part.minimum - reach) & (local <= part.maximum + reach)).all(axis=1))
-        distance, _ = surface.query(local[inside], distance_upper_bound=reach)
-        rows = np.delete(rows, inside[np.isfinite(distance)])
-    cells = np.floor(scene.points[rows] / (config.candidates.seed_spacing * part.diameter)).astype(np.int64)
-    _, which, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    result = np.zeros_like(free)
-    result[rows[counts[which.reshape(-1)] >= _LEAST_CROWD]] = True
-    return result
-
-
-def _one_a_place(found: Candidates, score: Float[np.ndarray, " s"], part: Part, reach: float) -> list[int]:
-    """Return rows of the best candidates whose centres are apart; scores of zero do not count."""
-    centers = (found.T_view_object @ np.append((part.minimum + part.maximum) / 2, 1))[:, :3]
-    chosen: list[int] = []
-    for row in np.argsort(-score, kind="stable")[: int((score > 0).sum())].tolist():
-        if (np.linalg.norm(centers[chosen] - centers[row], axis=1) > reach).all():
-            chosen.append(row)
-    return chosen
 
 
 def _detection(row: int, probability: float, gap: float, found: Candidates, part: Part, scene: Scene) -> Detection:

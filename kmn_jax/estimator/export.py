@@ -18,7 +18,7 @@ from kmn_jax.estimator.estimator import PoseEstimator
 from kmn_jax.estimator.evidence import Sight, evidence_of
 from kmn_jax.estimator.part import Part
 from kmn_jax.estimator.scene import LEAST_POINTS
-from kmn_jax.estimator.search import SceneArrays, crop_features, search
+from kmn_jax.estimator.search import SceneArrays, crop_features, search, seed_keys
 from kmn_jax.estimator.select import distances, overlaps, same_place, symmetry_transforms
 from kmn_jax.estimator.verify import depth_buffer
 from kmn_jax.files import write_whole
@@ -66,7 +66,7 @@ def _program(estimator: PoseEstimator, part: Part) -> Callable[..., dict[str, Ar
         points = jnp.where(mask[:, None], points, 0)
         scene = SceneArrays(points, mask)
         rows, real = spread_seeds(scene, mask, count=NUM_SEEDS)
-        crop_key, pose_key = jax.random.split(jax.random.wrap_key_data(key))
+        crop_keys, pose_keys = seed_keys(jax.random.wrap_key_data(key), NUM_SEEDS)
         crops = crop_features(
             model.graphdef,
             model.parameters,
@@ -74,11 +74,11 @@ def _program(estimator: PoseEstimator, part: Part) -> Callable[..., dict[str, Ar
             rows,
             real,
             diameter,
-            crop_key,
+            crop_keys,
             settings.search,
             num_points=model.config.num_scene_points,
         )
-        found, said = search(model.graphdef, model.parameters, own, crops, pose_key, settings.search)
+        found, said = search(model.graphdef, model.parameters, own, crops, pose_keys, settings.search)
         camera = _fitting_camera(scene)
         sight = Sight(depth_buffer(points, mask, camera, (_SIDE, _SIDE)), camera)
         proof = evidence_of(found, said, crops, own, surfels, sight, settings.verify)

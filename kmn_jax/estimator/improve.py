@@ -25,7 +25,7 @@ from kmn_jax.estimator.select import padded_symmetries
 from kmn_jax.estimator.verify import VerifyConfig, agreement
 from kmn_jax.geometry import compose, inverse, nearest, transform_points
 from kmn_jax.pose import IcpConfig, icp, mssd
-from kmn_jax.typing import Points, Pose, PRNGKey, Scalar
+from kmn_jax.typing import Points, Pose, Scalar
 
 _ALIKE = 0.3  # cosine of normals, for a point that may lie on a pose's surface
 _SAME = 0.1  # diameters between points of turned and unturned parts that look the same
@@ -98,7 +98,7 @@ def improve(
     turns: Float[Array, "v 4 4"],
     is_rival: Bool[Array, " v"],
     diameter: Scalar,
-    key: PRNGKey,
+    keys: Key[Array, " k"],
     config: ImproveConfig,
     verify: VerifyConfig,
 ) -> tuple[Float[Array, "k a 4 4"], Bool[Array, "k a"]]:
@@ -166,4 +166,4 @@ def improve(
 
         return jax.lax.map(lambda item: finish(*item), (starts, there)), there
 
-    return each(one, real, poses, seeds, jax.random.split(key, poses.shape[0]))
+    return each(one, real, poses, seeds, keys)

@@ -93,6 +93,12 @@ def spread_seeds(
     return rows, ~same & usable[anchor]
 
 
+def seed_keys(key: PRNGKey, count: int) -> tuple[Key[Array, " s"], Key[Array, " s"]]:
+    """Return keys of so many crops, and of the pose searches in them."""
+    crop_key, pose_key = jax.random.split(key)
+    return jax.random.split(crop_key, count), jax.random.split(pose_key, count)
+
+
 @partial(jax.jit, static_argnames=("graphdef", "config", "num_points"))
 def crop_features(
     graphdef: nnx.GraphDef,
@@ -101,7 +107,7 @@ def crop_features(
     seeds: Int[Array, " s"],
     real: Bool[Array, " s"],
     length: Scalar,
-    key: PRNGKey,
+    keys: Key[Array, " s"],
     config: SearchConfig,
     num_points: int,
 ) -> CropFeatures:
@@ -125,7 +131,7 @@ def crop_features(
         features = network.encode_scene(cloud, length, crop.mask)
         return CropFeatures(crop.points, crop.normals, crop.mask, crop.seed, crop.valid, features)
 
-    return each(one, real, seeds, jax.random.split(key, seeds.shape[0]))
+    return each(one, real, seeds, keys)
 
 
 @partial(jax.jit, static_argnames=("graphdef", "config"))
@@ -134,7 +140,7 @@ def search(
     parameters: nnx.State,
     part: PartArrays,
     crops: CropFeatures,
-    key: PRNGKey,
+    keys: Key[Array, " s"],
     config: SearchConfig,
 ) -> tuple[Hypotheses, Predictions]:
     """Return the best poses of a part in each valid crop, and what the network says of its points."""
@@ -177,7 +183,7 @@ def search(
         )
         return found, Predictions(on_object, jax.nn.softmax(logits, axis=1))
 
-    found, predictions = each(one, crops.valid, crops, jax.random.split(key, crops.seed.shape[0]))
+    found, predictions = each(one, crops.valid, crops, keys)
     poses = jnp.where(found.found[:, :, None, None], found.T_scene_object, jnp.eye(4)[None, None])
     return found._replace(T_scene_object=poses), predictions
 

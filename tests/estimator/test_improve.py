@@ -93,7 +93,7 @@ def test_turned_poses_come_back(part: Part, scene: Scene) -> None:
         jnp.asarray(turns),
         jnp.asarray(is_rival),
         jnp.float32(part.diameter),
-        jax.random.key(0),
+        jax.random.split(jax.random.key(0), len(starts)),
         ImproveConfig(margin=2.0),
         VerifyConfig(),
     )

@@ -13,7 +13,8 @@ from kmn_jax.checks import InputError
 from kmn_jax.estimator import DetectConfig
 from kmn_jax.estimator.calibrate import Calibration, Probabilities
 from kmn_jax.estimator.candidates import NUM_SEEDS, CandidateConfig, Solver, seeds_over
-from kmn_jax.estimator.detect import detect
+from kmn_jax.estimator.coverage import CoverageConfig
+from kmn_jax.estimator.detect import THOROUGH, detect
 from kmn_jax.estimator.evidence import EVIDENCE
 from kmn_jax.estimator.part import Part
 from kmn_jax.estimator.result import Detections
@@ -25,6 +26,7 @@ from tests.estimator.box_sample import box_part, box_view
 from tests.reference.networks import TINY
 
 SURE = Calibration(EVIDENCE, (0.0,) * len(EVIDENCE), 3.0)
+QUICK = DetectConfig()
 DIAMETER = 0.8
 
 
@@ -61,17 +63,29 @@ def rounds(model: Model, scene: Scene, found_from: int, config: DetectConfig) ->
     return asked, detect(model, Probabilities(SURE, SURE), small, scene, 0, config, solver=solver)
 
 
+def nearest_seeds(asked: list[np.ndarray], scene: Scene) -> np.ndarray:
+    return np.linalg.norm(scene.points[::50, None] - np.concatenate(asked)[None], axis=2).min(axis=1)
+
+
 def test_a_bin_is_searched_until_a_seed_is_near_to_all_of_it(model: Model, scene: Scene) -> None:
-    asked, found = rounds(model, scene, 0, DetectConfig())
-    assert [len(seeds) for seeds in asked[:-1]] == [NUM_SEEDS, *[DetectConfig().later_seeds] * (len(asked) - 2)]
+    asked, found = rounds(model, scene, 0, THOROUGH)
+    assert len(asked[0]) == NUM_SEEDS
+    assert max(len(seeds) for seeds in asked[1:]) == THOROUGH.later_seeds
     seeds = np.concatenate(asked)
     apart = np.linalg.norm(seeds[:, None] - seeds[None], axis=2)[np.triu_indices(len(seeds), 1)]
-    assert apart.min() > DetectConfig().searched * DIAMETER
-    away = np.linalg.norm(scene.points[::50, None] - seeds[None], axis=2).min(axis=1)
-    assert np.mean(away <= CandidateConfig().seed_spacing * DIAMETER) > 0.98  # but for a few stray points
+    assert apart.min() > THOROUGH.coverage.searched_finely * DIAMETER
+    # But for a few stray points, and what is between the spacing of seeds and the reach of one.
+    assert np.mean(nearest_seeds(asked, scene) <= CandidateConfig().seed_spacing * DIAMETER) > 0.98
     assert not found.warnings
     assert found.reason is not None
     assert f"any of the {len(seeds)} places" in found.reason
+
+
+def test_where_nothing_is_found_it_is_searched_coarsely(model: Model, scene: Scene) -> None:
+    fine, coarse = (rounds(model, scene, 0, config)[0] for config in (THOROUGH, QUICK))
+    assert len(np.concatenate(coarse)) < len(np.concatenate(fine))
+    assert np.mean(nearest_seeds(coarse, scene) <= 1.1 * QUICK.coverage.searched * DIAMETER) > 0.98
+    assert np.isin(np.concatenate(coarse), np.concatenate(fine)).all()  # it only ends earlier
 
 
 def test_a_search_that_is_given_up_says_so(model: Model, scene: Scene) -> None:
@@ -81,7 +95,7 @@ def test_a_search_that_is_given_up_says_so(model: Model, scene: Scene) -> None:
 
 
 def test_likely_poses_cover_what_they_explain(model: Model, scene: Scene) -> None:
-    nothing, something = (rounds(model, scene, until, DetectConfig())[0] for until in (0, 99))
+    nothing, something = (rounds(model, scene, until, THOROUGH)[0] for until in (0, 99))
     assert len(np.concatenate(something)) < len(np.concatenate(nothing))
 
 
@@ -94,8 +108,17 @@ def test_seeds_are_no_more_than_asked_for_or_needed(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    "values", [{"most_seeds": 0}, {"later_seeds": 0}, {"reported": 0.6}, {"explained": 0.0}, {"searched": 0.0}]
+    ("kind", "values"),
+    [
+        (DetectConfig, {"most_seeds": 0}),
+        (DetectConfig, {"later_seeds": 0}),
+        (DetectConfig, {"reported": 0.6}),
+        (CoverageConfig, {"explained": 0.0}),
+        (CoverageConfig, {"searched": 0.1}),
+        (CoverageConfig, {"searched_finely": 0.0}),
+        (CoverageConfig, {"patience": 0}),
+    ],
 )
-def test_contradictory_values_are_refused(values: dict[str, float]) -> None:
+def test_contradictory_values_are_refused(kind: type, values: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(values))):
-        DetectConfig(**values)  # type: ignore[arg-type]
+        kind(**values)

@@ -17,6 +17,7 @@ from kmn_jax.estimator.search import (
     SearchConfig,
     crop_features,
     search,
+    seed_keys,
     spread_seeds,
 )
 from kmn_jax.estimator.verify import VerifyConfig, depth_buffer
@@ -53,7 +54,7 @@ def run(
 ) -> dict[str, jax.Array]:
     """Return the fields of hypotheses and predictions, and the evidence."""
     rows, flags = jnp.asarray(seeds, "i4"), jnp.arange(len(seeds)) < (len(seeds) if real is None else real)
-    one, other = jax.random.split(jax.random.key(0))
+    one, other = seed_keys(jax.random.key(0), len(seeds))
     crops = crop_features(
         model.graphdef, model.parameters, where, rows, flags, part.diameter, one, CONFIG, num_points=64
     )
