@@ -17,8 +17,8 @@ COMPILE := .venv-lock/bin/uv --no-config pip compile --quiet --generate-hashes -
 help: ## list these verbs
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
 
-demo: $(READY) ## solve a registration problem end to end and print the pose
-	$(BIN)/python -m experiments.demo
+demo: $(READY) ## find parts in the small test set beside two rivals, and write a report
+	$(BIN)/python -m experiments.evaluate demo
 
 test: $(READY) ## run the tests
 	$(BIN)/python -m pytest

@@ -1,0 +1,157 @@
+"""Recall and time of our poses and of every rival's on the same crops: `python -m experiments.evaluate NAME`.
+
+NAME is one of `experiments.evaluation.configs`; each of its fields can be given, too. Poses are exported once to
+outputs/evaluation/NAME and scored from there: a stopped run goes on where it was, and a run of another recipe is
+refused. The report, Markdown and a page of HTML that needs no other file, is written beside them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from experiments.evaluation.cases import ObjectImages, limited
+from experiments.evaluation.configs import CONFIGS, EvaluateConfig, find_config
+from experiments.evaluation.methods import Method, Ours, OursConfig
+from experiments.evaluation.predictions import Export, code_digest, export
+from experiments.evaluation.refinement import SETTINGS
+from experiments.evaluation.report import Result, draw_pictures, write_report
+from experiments.evaluation.rivals import RIVALS, OverMatches, missing
+from experiments.evaluation.scores import cells_of
+from experiments.evaluation.sources import bop_objects, cloud_objects
+from experiments.test_sets import build_test_set
+from kmn_jax.checks import InputError
+from kmn_jax.data.bop import dataset_digest
+from kmn_jax.data.build import Source
+from kmn_jax.data.mesh_files import MESH_SUFFIXES
+from kmn_jax.estimator.part import model_digest
+from kmn_jax.models import Model, load_model, released_file
+from kmn_jax.pose import RansacConfig
+from kmn_jax.report import environment, processor
+
+
+@dataclass(frozen=True)
+class Options:
+    """How it is carried out; every field of the config can be given too."""
+
+    config: Annotated[EvaluateConfig, tyro.conf.arg(name="")]
+    output: Path | None = None  # folder; outputs/evaluation/NAME unless given
+    overwrite: bool = False  # delete predictions of another recipe that are there
+
+
+def evaluate(options: Options) -> Path:
+    """Evaluate and return the path of the report's page."""
+    config = options.config
+    folder = options.output or Path("outputs") / "evaluation" / config.name
+    path = Path(config.weights)
+    model = load_model(path if path.suffix == ".safetensors" else released_file(config.weights))
+    methods, skipped = _methods(config, model)
+    problems: list[str] = []
+    objects = _objects(config, problems)
+    recipe = {
+        "config": {key: value for key, value in asdict(config).items() if key not in ("methods", "name")},
+        "data": _data_digest(config),
+        "weights": model_digest(model),
+        "code": code_digest(),
+        "methods": {key: method.settings for key, method in methods.items()},
+        "refinement": {key: str(value) for key, value in SETTINGS.items()},
+        "processor": processor(),
+    }
+    exported = Export.open(folder, recipe, options.overwrite)
+    export(objects, methods, config.noise, config.crops, config.seed, exported)
+    titles = {key: method.name for key, method in methods.items()}
+    cells = cells_of(exported, {found.name: found.model for found in objects}, titles, config.noise)
+    result = Result(config, environment(), exported.recipe, cells, skipped, tuple(problems))
+    own = methods.get("ours")
+    pictures = draw_pictures(result, objects, exported, own if isinstance(own, Ours) else None)
+    return write_report(folder, result, pictures)
+
+
+def _methods(config: EvaluateConfig, model: Model) -> tuple[dict[str, Method], dict[str, str]]:
+    """Return the methods that can run, and why others cannot."""
+    methods: dict[str, Method] = {}
+    skipped: dict[str, str] = {}
+    for name in config.methods:
+        reason = None
+        if name == "ours":
+            methods[name] = Ours("kmn_jax", model)
+        elif name == "ours_no_normals":
+            unchecked = OursConfig(ransac=RansacConfig(use_normals=False))
+            methods[name] = Ours("kmn_jax without normal check", model, unchecked)
+        elif name == "ours_open3d":
+            reason = missing("open3d")
+            if reason is None:
+                methods[name] = Ours("kmn_jax network, Open3D RANSAC", model, search=OverMatches())
+        else:
+            module, make = RIVALS[name]
+            reason = missing(module)
+            if reason is None:
+                methods[name] = make()
+        if reason is not None:
+            skipped[name] = reason
+            print(f"skipped {name}: {reason}", file=sys.stderr)
+    if not methods:
+        raise InputError(f"none of the methods can run: {'; '.join(skipped.values())}")
+    return methods, skipped
+
+
+def _objects(config: EvaluateConfig, problems: list[str]) -> list[ObjectImages]:
+    def report(problem: str) -> None:
+        if problem not in problems:
+            problems.append(problem)
+            print(f"left out: {problem}", file=sys.stderr)
+
+    if config.folder is None:
+        raise InputError(f"{config.name} needs a folder: give it with --folder")
+    if config.source == "clouds":
+        place, images = config.sensor_place, config.images
+        found = cloud_objects(config.folder, config.object, config.camera, config.units, place, report, images)
+    else:
+        if config.cad is not None and not config.folder.exists():
+            _make_bins(config.folder, config.cad, config.cad_names)
+        found = bop_objects(config.folder, config.split, report, config.images)
+    found = limited(found, config.objects)
+    if not found:
+        raise InputError(f"none of the objects is named {', '.join(config.objects)}")
+    return found
+
+
+def _make_bins(folder: Path, cad: Path, names: tuple[str, ...]) -> None:
+    """Make bins of the CAD files of a folder, as those of the test sets."""
+    paths = sorted(path for path in cad.glob("*") if path.suffix.lower() in MESH_SUFFIXES)
+    chosen = [path for path in paths if not names or any(name in path.stem for name in names)]
+    if not chosen:
+        raise InputError(f"{cad} holds no CAD file{f' named like {names}' if names else ''}")
+    build_test_set(folder, [Source(path.stem, "test", path) for path in chosen])
+
+
+def _data_digest(config: EvaluateConfig) -> str:
+    """Return a digest of all that is read: a BOP dataset, or the files beside the clouds."""
+    assert config.folder is not None
+    extra = b"".join(path.read_bytes() for path in (config.object, config.camera) if path is not None)
+    return hashlib.sha256(dataset_digest(config.folder).encode() + extra).hexdigest()
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Evaluate: 0 is success, 2 bad input, in one sentence on stderr."""
+    name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    try:
+        if name.startswith("-"):
+            print(f"{__doc__}\nNames: {', '.join(CONFIGS)}. Fields: python -m experiments.evaluate NAME --help")
+            return 0 if name in ("-h", "--help") else 2
+        default = Options(find_config(name))
+        page = evaluate(tyro.cli(Options, default=default, args=rest, prog=f"experiments.evaluate {name}"))
+    except InputError as error:
+        print(f"evaluate: {error}", file=sys.stderr)
+        return 2
+    print(f"\nreport: {page}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

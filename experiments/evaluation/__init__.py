@@ -1,0 +1,1 @@
+"""Recall and time of pose methods on the same crops: cases, methods, predictions, scores, report."""

@@ -1,0 +1,59 @@
+"""Recall over noise and over time."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from experiments.evaluation.scores import Cell, pooled
+from kmn_jax.checks import InputError
+
+
+def recall_plot(cells: Sequence[Cell], noises: Sequence[float]) -> bytes:
+    """Return a PNG: recall of all objects over noise, with intervals, and over the mean time without noise."""
+    figure, canvas = new_figure((12, 4.8))
+    over_noise, over_time = figure.subplots(1, 2)
+    for number, method in enumerate(dict.fromkeys(cell.method for cell in cells)):
+        own = [pooled([c for c in cells if c.method == method and c.noise == noise], "all") for noise in noises]
+        recall = np.array([cell.recall() for cell in own])
+        low, high = np.array([cell.interval() for cell in own]).T
+        style = {"color": f"C{number // 2 % 10}", "ls": "-" if method.endswith("ICP") else ":", "marker": "o", "ms": 4}
+        shift = 1 + 0.01 * number
+        places = [100 * noise * shift for noise in noises]
+        over_noise.errorbar(places, recall, [recall - low, high - recall], label=method, lw=1.2, capsize=2, **style)
+        seconds = np.concatenate([cell.seconds for cell in own])
+        if len(seconds):
+            over_time.plot(
+                1e3 * seconds.mean(), recall[0], "o" if method.endswith("ICP") else "x", color=style["color"]
+            )
+            over_time.annotate(
+                method, (1e3 * seconds.mean(), recall[0]), xytext=(4, 3), textcoords="offset points", size=7
+            )
+    over_noise.set(xlabel="noise, % of the longest side", ylabel="recall (ADI below 0.1 diameters)", ylim=(0, 1.02))
+    over_noise.legend(fontsize=7)
+    over_time.set(xlabel="mean ms a crop, warm", xscale="log", ylabel=f"recall, noise {noises[0]:.0%}", ylim=(0, 1.02))
+    over_time.margins(x=0.25)
+    for axis in (over_noise, over_time):
+        axis.grid(alpha=0.3)
+    return as_png(canvas)
+
+
+def new_figure(size: tuple[float, float]) -> tuple[Any, Any]:
+    """Return a figure that needs no screen, and its canvas. Raises InputError without matplotlib."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise InputError("reports need a package that is not installed: pip install 'kmn_jax[plots]'") from None
+    figure = Figure(figsize=size, layout="constrained", dpi=100)
+    return figure, FigureCanvasAgg(figure)
+
+
+def as_png(canvas: Any) -> bytes:
+    """Return a figure as a file."""
+    content = io.BytesIO()
+    canvas.print_png(content)
+    return content.getvalue()

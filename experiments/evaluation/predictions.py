@@ -1,0 +1,196 @@
+"""Poses of methods on cases, exported once with what made them, and read as often as they are scored.
+
+One file for each method, object and noise, and one for the cases of an object and noise: an export goes on where it was
+stopped. What was made by another recipe (config, data, weights, code) is refused, not mixed in.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from safetensors.numpy import save
+
+from experiments.evaluation.cases import Case, ObjectImages, draw_cases
+from experiments.evaluation.methods import Method
+from experiments.evaluation.refinement import Refinement
+from kmn_jax.checks import InputError
+from kmn_jax.files import read_safetensors, write_whole
+
+_ROOT = Path(__file__).parents[2]
+_CODE = ("kmn_jax/geometry", "kmn_jax/models", "kmn_jax/pose", "kmn_jax/data/crops.py", "experiments/evaluation")
+_NOT_POSES = ("scores.py", "report.py", "plots.py", "pictures.py", "published.py")  # of experiments/evaluation
+_HEADER = "kmn_jax evaluation 1"
+
+
+class Truth(NamedTuple):
+    """The true poses of cases, and where their crops are; in millimetres and the camera's frame."""
+
+    names: tuple[str, ...]
+    T_camera_object: tuple[Float[np.ndarray, "i 4 4"], ...]  # of all copies in each case's scan
+    copy: tuple[int, ...]
+    visible: Float[np.ndarray, " c"]
+
+
+class Predictions(NamedTuple):
+    """What a method found in each case, and how long it took, first call left out."""
+
+    T_camera_object: Float[np.ndarray, "c 4 4"]
+    refined: Float[np.ndarray, "c 4 4"]
+    found: Bool[np.ndarray, " c"]
+    seconds: Float[np.ndarray, " c"]
+    refine_seconds: Float[np.ndarray, " c"]
+
+
+@dataclass(frozen=True)
+class Export:
+    """A folder of predictions of one recipe."""
+
+    folder: Path
+    recipe: Mapping[str, Any]
+
+    @classmethod
+    def open(cls, folder: Path, recipe: Mapping[str, Any], overwrite: bool) -> Export:
+        """Claim a folder. Raises InputError if it holds predictions of another recipe and is not to be overwritten."""
+        file = folder / "recipe.json"
+        plain = json.loads(json.dumps(recipe, default=str))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            old = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
+        except (OSError, ValueError) as error:
+            raise InputError(f"{file} cannot be read ({error}): choose another folder with --output") from None
+        if old is not None and old != plain and not overwrite:
+            differing = ", ".join(sorted(key for key in {*old, *plain} if old.get(key) != plain.get(key)))
+            raise InputError(
+                f"{folder} holds predictions of another recipe (differing: {differing}): give --overwrite to make them"
+                " anew, or another folder with --output"
+            )
+        if old != plain:
+            for stale in folder.rglob("*.safetensors"):
+                stale.unlink()
+        write_whole(file, (json.dumps(plain, indent=1) + "\n").encode())
+        return cls(folder, plain)
+
+    def path(self, method: str, name: str, noise: float) -> Path:
+        """Return the file of an object and noise."""
+        return self.folder / _slug(method) / f"{_slug(name)}.noise{noise:g}.safetensors"
+
+    def write_truth(self, name: str, noise: float, cases: Sequence[Case]) -> None:
+        """Write the true poses of cases."""
+        counts = [len(case.T_camera_object) for case in cases]
+        tensors = {
+            "poses": np.concatenate([case.T_camera_object for case in cases]) if cases else np.zeros((0, 4, 4)),
+            "counts": np.array(counts, dtype=np.int64),
+            "copy": np.array([case.copy for case in cases], dtype=np.int64),
+            "visible": np.array([case.visible for case in cases], dtype=np.float64),
+        }
+        self._write(self.path("cases", name, noise), tensors, {"names": json.dumps([case.name for case in cases])})
+
+    def truth(self, name: str, noise: float) -> Truth:
+        """Read the true poses of cases. Raises InputError if they are not there."""
+        tensors, metadata = self._read(self.path("cases", name, noise))
+        ends = np.cumsum(tensors["counts"])[:-1]
+        return Truth(
+            tuple(json.loads(metadata["names"])),
+            tuple(np.split(tensors["poses"], ends)) if len(tensors["counts"]) else (),
+            tuple(tensors["copy"].tolist()),
+            tensors["visible"],
+        )
+
+    def write(self, method: str, name: str, noise: float, found: Predictions) -> None:
+        """Write what a method found."""
+        self._write(self.path(method, name, noise), found._asdict(), {})
+
+    def read(self, method: str, name: str, noise: float) -> Predictions:
+        """Read what a method found. Raises InputError if it is not there."""
+        return Predictions(**self._read(self.path(method, name, noise))[0])
+
+    def _write(self, path: Path, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        plain = {key: np.ascontiguousarray(value) for key, value in tensors.items()}
+        write_whole(path, save(plain, metadata={"format": _HEADER, "recipe": self._digest, **metadata}))
+
+    def _read(self, path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+        tensors, metadata = read_safetensors(path)
+        if metadata.get("format") != _HEADER or metadata.get("recipe") != self._digest:
+            raise InputError(f"{path} was made by another recipe: delete it, and evaluate again")
+        return tensors, metadata
+
+    @property
+    def _digest(self) -> str:
+        return hashlib.sha256(json.dumps(self.recipe, sort_keys=True).encode()).hexdigest()
+
+
+def export(
+    objects: Sequence[ObjectImages],
+    methods: Mapping[str, Method],
+    noises: Sequence[float],
+    crops: int,
+    seed: int,
+    folder: Export,
+) -> None:
+    """Run all methods on all cases, but those of which there are files. Shows its progress."""
+    from tqdm import tqdm
+
+    units = [(found, noise) for found in objects for noise in noises]
+    bar = tqdm(total=len(units) * len(methods), unit="set", desc="poses")
+    for found, noise in units:
+        missing = {key: method for key, method in methods.items() if not folder.path(key, found.name, noise).exists()}
+        bar.update(len(methods) - len(missing))
+        known = folder.path("cases", found.name, noise).exists()
+        if not missing and known:
+            continue
+        cases = list(draw_cases(found, crops, noise, seed))
+        folder.write_truth(found.name, noise, cases)
+        refine = Refinement(found.model)
+        for key, method in missing.items():
+            bar.set_postfix_str(f"{found.name[:24]}, noise {noise:g}, {method.name}", refresh=True)
+            folder.write(key, found.name, noise, _solved(method.prepare(found.model), refine, cases))
+            bar.update()
+    bar.close()
+
+
+def _solved(solve: Callable[[Case], Any], refine: Refinement, cases: Sequence[Case]) -> Predictions:
+    """Solve cases one after another; what is compiled or loaded the first time is not timed."""
+    if not cases:
+        none = np.zeros(0)
+        return Predictions(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), np.zeros(0, dtype=bool), none, none)
+    rows = [_timed(solve, refine, case) for case in (cases[0], *cases)][1:]
+    return Predictions(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def _timed(solve: Callable[[Case], Any], refine: Refinement, case: Case) -> tuple[Any, ...]:
+    start = time.perf_counter()
+    pose = solve(case)
+    middle = time.perf_counter()
+    nothing = np.eye(4)
+    refined = nothing if pose is None else refine(case, pose)
+    end = time.perf_counter()
+    return nothing if pose is None else pose, refined, pose is not None, middle - start, end - middle
+
+
+def code_digest() -> str:
+    """Return the SHA-256 of all code that decides poses."""
+    digest = hashlib.sha256()
+    for path in _sources():
+        digest.update(path.relative_to(_ROOT).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _sources() -> Iterator[Path]:
+    for name in _CODE:
+        place = _ROOT / name
+        files = [place] if place.is_file() else sorted(place.rglob("*.py"))
+        yield from (file for file in files if file.name not in _NOT_POSES)
+
+
+def _slug(name: str) -> str:
+    return "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in name)

@@ -1,0 +1,58 @@
+"""The refinement that the poses of all methods get: our ICP on the points of the crop."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from experiments.evaluation.cases import Case
+from experiments.evaluation.methods import drawn_crop, padded
+from kmn_jax.data.cad import ObjectModel
+from kmn_jax.estimator.search import SceneArrays
+from kmn_jax.pose import IcpConfig, icp
+from kmn_jax.typing import Pose, PRNGKey, Scalar
+
+CONFIG = IcpConfig(iterations=20)
+_OBJECT_POINTS, _SCENE_POINTS = 2048, 512
+_NORMAL_RADIUS, _NORMAL_POINTS = 0.06, 4096
+SETTINGS = {"icp": CONFIG, "object points": _OBJECT_POINTS, "scene points": _SCENE_POINTS}
+
+
+class Refinement:
+    """Refine poses of one object."""
+
+    def __init__(self, model: ObjectModel) -> None:
+        self._points = jnp.asarray(model.points[:_OBJECT_POINTS], dtype=jnp.float32)
+        self._diameter = jnp.float32(model.diameter)
+
+    def __call__(self, case: Case, T_camera_object: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+        """Return a pose that is no worse."""
+        origin = case.points[0].astype(np.float64)
+        pose = T_camera_object.copy()
+        pose[:3, 3] -= origin
+        key = jax.random.key(case.random_seed)
+        found = _refined(self._points, padded(case.points), pose.astype(np.float32), self._diameter, key)
+        pose = np.asarray(found, dtype=np.float64)
+        pose[:3, 3] += origin
+        return pose
+
+
+@partial(jax.jit)
+def _refined(
+    points: Float[Array, "m 3"], scene: SceneArrays, T_crop_object: Pose, diameter: Scalar, key: PRNGKey
+) -> Pose:
+    crop = drawn_crop(scene, diameter, key, _SCENE_POINTS, _NORMAL_RADIUS, _NORMAL_POINTS)
+    fine = icp(
+        points,
+        crop.points,
+        T_crop_object,
+        diameter,
+        scene_normals=crop.normals,
+        scene_mask=crop.mask,
+        config=CONFIG,
+    )
+    return fine.T_scene_object

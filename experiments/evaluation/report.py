@@ -1,0 +1,247 @@
+"""The report of an evaluation: Markdown, and a page of HTML that needs no other file."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.evaluation.cases import ObjectImages, draw_cases
+from experiments.evaluation.configs import EvaluateConfig
+from experiments.evaluation.methods import Ours
+from experiments.evaluation.pictures import Shown, case_grid
+from experiments.evaluation.plots import recall_plot
+from experiments.evaluation.predictions import Export
+from experiments.evaluation.published import MILLISECONDS, RECALL, SOURCE
+from experiments.evaluation.scores import Cell, case_errors, object_rows, pooled, recall_rows
+from kmn_jax.files import write_whole
+from kmn_jax.report import markdown_table, print_table
+
+_SHOWN = "ours"  # the method whose cases are drawn, if it ran
+_GATES = (
+    "A pose is right if its ADI to the nearest copy is below a tenth of the object's diameter, in the second column of "
+    "each noise below a tenth of its bounding box's diagonal. In brackets: Wilson's 95% interval. Times are of one "
+    "crop after another, warm, with the object prepared beforehand; rows with ICP include it, the same for all."
+)
+
+
+@dataclass(frozen=True)
+class Result:
+    """All that is reported."""
+
+    config: EvaluateConfig
+    environment: Mapping[str, Any]
+    recipe: Mapping[str, Any]
+    cells: Sequence[Cell]
+    skipped: Mapping[str, str]  # why methods could not run
+    problems: Sequence[str]  # what of the data was left out
+
+
+def write_report(folder: Path, result: Result, pictures: Mapping[str, bytes]) -> Path:
+    """Write report.md, report.html, scores.json and the pictures; return the page."""
+    sections = list(_sections(result))
+    for name, content in pictures.items():
+        write_whole(folder / f"{name}.png", content)
+    write_whole(folder / "report.md", _markdown(result, sections, pictures).encode())
+    page = folder / "report.html"
+    write_whole(page, _page(result, sections, pictures).encode())
+    write_whole(folder / "scores.json", (json.dumps(_scores(result), indent=1) + "\n").encode())
+    print_table(f"{result.config.name}: recall", recall_rows(result.cells, "all"))
+    return page
+
+
+def draw_pictures(
+    result: Result, objects: Sequence[ObjectImages], exported: Export, method: Ours | None
+) -> dict[str, bytes]:
+    """Return the plot and the grid of cases by the names of their files."""
+    pictures = {"recall": recall_plot(result.cells, result.config.noise)}
+    if method is not None:
+        shown = _chosen_cases(result.config, objects, exported)
+        if shown:
+            pictures["cases"] = case_grid(method, shown)
+    return pictures
+
+
+def beaten_by(cells: Sequence[Cell], own: str) -> list[str]:
+    """Return a sentence for each object and noise at which another method's recall is higher than that of `own`."""
+    found = []
+    for cell in cells:
+        ours = next(c for c in cells if (c.method, c.object, c.noise) == (own, cell.object, cell.noise))
+        if cell.method.startswith("kmn_jax") or cell.recall() <= ours.recall():
+            continue
+        apart = cell.interval()[0] > ours.interval()[1]
+        found.append(
+            f"{cell.object}, noise {cell.noise:.0%}: {cell.method} {cell.recall():.2f}, {own} {ours.recall():.2f}"
+            f" ({'beyond' if apart else 'within'} the intervals)"
+        )
+    return found
+
+
+def _chosen_cases(config: EvaluateConfig, objects: Sequence[ObjectImages], exported: Export) -> list[Shown]:
+    """Return the best, the median and the worst case over all objects, at the least noise and at the most."""
+    chosen = []
+    for noise in dict.fromkeys((min(config.noise), max(config.noise))):
+        errors = [case_errors(exported, found.name, noise, _SHOWN, found.model) for found in objects]
+        ranked = sorted((e, place, row) for place, own in enumerate(errors) for row, e in enumerate(own))
+        if not ranked:
+            continue
+        picks = {"best": ranked[0], "median": ranked[len(ranked) // 2], "worst": ranked[-1]}
+        # Of poses far from every copy, or none, all are equally bad: one of each of three objects is shown.
+        lost = list({place: (e, place, row) for e, place, row in reversed(ranked) if not np.isfinite(e)}.values())
+        picks |= {f"lost {number + 1}": pick for number, pick in enumerate(lost[:3])}
+        for title, (error, place, row) in picks.items():
+            found = objects[place]
+            case = list(draw_cases(found, config.crops, noise, config.seed))[row]
+            poses = exported.read(_SHOWN, found.name, noise)
+            pose = poses.refined[row] if poses.found[row] else None
+            chosen.append(Shown(f"{title}, noise {noise:.0%}", found.model, case, pose, float(error)))
+    return chosen
+
+
+def _sections(result: Result) -> list[tuple[str, str, list[dict[str, Any]]]]:
+    """Return headings, texts and tables."""
+    config, cells = result.config, result.cells
+    objects = list(dict.fromkeys(cell.object for cell in cells))
+    rows = recall_rows(cells, "all")
+    sections = [(f"Recall on {len(objects)} objects, {config.crops} crops of each", _GATES, rows)]
+    if config.name in RECALL:
+        sections.append(("Published", f"{SOURCE}. {MILLISECONDS}.", RECALL[config.name]))
+    own = next((cell.method for cell in cells if cell.method == "kmn_jax + ICP"), None)
+    if own is not None:
+        lines = beaten_by(cells, own)
+        whole = [
+            pooled([c for c in cells if c.method == method and c.noise == noise], "all objects")
+            for method in dict.fromkeys(cell.method for cell in cells)
+            for noise in config.noise
+        ]
+        lines = [*beaten_by(whole, own), *lines]
+        text = "\n".join(f"- {line}" for line in lines) or "Nowhere."
+        sections.append((f"Where another method finds more than {own}", text, []))
+    for noise in config.noise:
+        sections.append((f"By object, noise {noise:.0%}", "", object_rows(cells, noise)))
+    left_out = [f"{name}: {reason}" for name, reason in result.skipped.items()] + list(result.problems)
+    sections.append(("Left out", "\n".join(f"- {line}" for line in left_out) or "Nothing.", []))
+    settings = [
+        {"method": name, "settings": json.dumps(values)} for name, values in result.recipe["methods"].items()
+    ] + [{"method": "ICP of all", "settings": json.dumps(result.recipe["refinement"])}]
+    sections.append(("Settings; lengths are shares of the diameter", "", settings))
+    return sections
+
+
+def _facts(result: Result) -> dict[str, str]:
+    environment = result.environment
+    versions = ", ".join(f"{key} {value}" for key, value in environment["versions"].items())
+    return {
+        "Command": environment["command"],
+        "Commit": str(environment["commit"]),
+        "Date": environment["date"],
+        "Machine": f"{environment['processor']}, {environment['cores']} cores, {environment['platform']}",
+        "Versions": versions,
+        "Weights": f"{result.config.weights}, SHA-256 {str(result.recipe['weights'])[:16]}",
+        "Data": f"{result.config.name}, digest {str(result.recipe['data'])[:16]}, seed {result.config.seed}",
+    }
+
+
+def _markdown(
+    result: Result, sections: Sequence[tuple[str, str, list[dict[str, Any]]]], pictures: Mapping[str, bytes]
+) -> str:
+    parts = [f"# Evaluation: {result.config.name}"]
+    parts.append("\n".join(f"- {key}: {value}" for key, value in _facts(result).items()))
+    for title, text, rows in sections:
+        parts += [f"## {title}", *([text] if text else []), *([markdown_table(rows)] if rows else [])]
+    parts += [f"![{name}]({name}.png)" for name in pictures]
+    return "\n\n".join(parts) + "\n"
+
+
+def _page(
+    result: Result, sections: Sequence[tuple[str, str, list[dict[str, Any]]]], pictures: Mapping[str, bytes]
+) -> str:
+    body = [f"<h1>Evaluation: {html.escape(result.config.name)}</h1>", "<dl>"]
+    body += [f"<dt>{html.escape(key)}</dt><dd>{html.escape(value)}</dd>" for key, value in _facts(result).items()]
+    body.append("</dl>")
+    drawn = {
+        name: f'<img alt="{name}" src="data:image/png;base64,{base64.b64encode(content).decode()}">'
+        for name, content in pictures.items()
+    }
+    for number, (title, text, rows) in enumerate(sections):
+        body += [f"<h2>{html.escape(title)}</h2>", _paragraphs(text), _table(rows)]
+        if number == 0:
+            body.append(drawn.pop("recall", ""))
+    body += [f"<h2>{html.escape(name)}</h2>{image}" for name, image in drawn.items()]
+    return _PAGE.replace("{title}", html.escape(result.config.name)).replace("{body}", "\n".join(body))
+
+
+def _paragraphs(text: str) -> str:
+    if not text:
+        return ""
+    lines = text.split("\n")
+    if all(line.startswith("- ") for line in lines):
+        return "<ul>" + "".join(f"<li>{html.escape(line[2:])}</li>" for line in lines) + "</ul>"
+    return f"<p>{html.escape(text)}</p>"
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> str:
+    if not rows:
+        return ""
+    columns = list(rows[0])
+    head = "".join(f"<th>{html.escape(column)}</th>" for column in columns)
+    lines = [
+        "<tr>" + "".join(f"<td>{html.escape(_text(row.get(column)))}</td>" for column in columns) + "</tr>"
+        for row in rows
+    ]
+    return f'<div class="wide"><table><tr>{head}</tr>{"".join(lines)}</table></div>'
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _scores(result: Result) -> dict[str, Any]:
+    """Return all cells in numbers."""
+    cells = [
+        {
+            "method": cell.method,
+            "object": cell.object,
+            "noise": cell.noise,
+            "crops": len(cell.errors),
+            "recall": {gate: cell.recall(gate) for gate in ("diameter", "diagonal")},
+            "interval": {gate: cell.interval(gate) for gate in ("diameter", "diagonal")},
+            "mean s": float(cell.seconds.mean()) if len(cell.seconds) else None,
+            "median s": float(np.median(cell.seconds)) if len(cell.seconds) else None,
+        }
+        for cell in result.cells
+    ]
+    facts = {"environment": dict(result.environment), "recipe": dict(result.recipe)}
+    return {**facts, "skipped": dict(result.skipped), "left out": list(result.problems), "cells": cells}
+
+
+_PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>kmn_jax evaluation: {title}</title>
+<style>
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1200px; padding: 0 1rem; color: #222; }
+h1 { font-size: 1.6rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .1rem 1rem; font-size: .85rem; }
+dt { color: #666; } dd { margin: 0; overflow-wrap: anywhere; }
+.wide { overflow-x: auto; } table { border-collapse: collapse; font-size: .85rem; }
+th, td { border-bottom: 1px solid #ddd; padding: .25rem .6rem; text-align: left; vertical-align: top; }
+th { border-bottom: 2px solid #888; white-space: nowrap; } td:not(:first-child) { min-width: 5.5rem; }
+img { max-width: 100%; }
+</style>
+</head>
+<body>
+{body}
+</body>
+</html>
+"""

@@ -1,0 +1,281 @@
+"""What our poses are compared with. Every length is a share of the object's diameter, stated in `settings`.
+
+All rivals get the same crops as we do, thinned to voxels, and the same refinement. Where an author recommends settings
+they are taken, scaled by the object's size; the published baseline's (arXiv 2303.16102: FPFH of 10 mm, gate of 5 mm,
+100,000 iterations, for parts of about 8 cm) are of that scale, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from experiments.evaluation.cases import Case
+from experiments.evaluation.methods import Solver
+from kmn_jax.data.cad import ObjectModel
+from kmn_jax.pose import Matches
+
+
+@dataclass(frozen=True)
+class FeatureSettings:
+    """Voxels and FPFH features as Open3D's registration tutorial scales them."""
+
+    voxel: float = 0.04
+    normal_voxels: float = 2.0  # radius, at most 30 neighbours
+    feature_voxels: float = 5.0  # radius, at most 100 neighbours
+
+
+@dataclass(frozen=True)
+class Fpfh:
+    """FPFH features, RANSAC over mutual nearest ones (Open3D)."""
+
+    name: str = "FPFH + RANSAC"
+    features: FeatureSettings = FeatureSettings()
+    gate_voxels: float = 1.5
+    edge_similarity: float = 0.9
+    iterations: int = 100_000
+    confidence: float = 0.999
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """All of them."""
+        return asdict(self)
+
+    def prepare(self, model: ObjectModel) -> Solver:
+        """Return a solver that describes each crop anew."""
+        open3d = quiet_open3d()
+        registration = open3d.pipelines.registration
+        voxel = self.features.voxel * model.diameter
+        gate = self.gate_voxels * voxel
+        source = thinned_cloud(model.points, model.normals, self.features, model.diameter)
+        described = fpfh_features(source, self.features, model.diameter)
+
+        def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
+            open3d.utility.random.seed(case.random_seed % 2**31)
+            target = thinned_cloud(case.points, None, self.features, model.diameter)
+            if len(target.points) < 10:
+                return None
+            found = registration.registration_ransac_based_on_feature_matching(
+                source,
+                target,
+                described,
+                fpfh_features(target, self.features, model.diameter),
+                True,
+                gate,
+                registration.TransformationEstimationPointToPoint(False),
+                3,
+                [
+                    registration.CorrespondenceCheckerBasedOnEdgeLength(self.edge_similarity),
+                    registration.CorrespondenceCheckerBasedOnDistance(gate),
+                ],
+                registration.RANSACConvergenceCriteria(self.iterations, self.confidence),
+            )
+            return np.array(found.transformation) if len(found.correspondence_set) else None
+
+        return solve
+
+
+@dataclass(frozen=True)
+class FastGlobal:
+    """FPFH features, Fast Global Registration (Open3D)."""
+
+    name: str = "FPFH + FGR"
+    features: FeatureSettings = FeatureSettings()
+    gate_voxels: float = 0.5
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """All of them."""
+        return asdict(self)
+
+    def prepare(self, model: ObjectModel) -> Solver:
+        """Return a solver that describes each crop anew."""
+        open3d = quiet_open3d()
+        registration = open3d.pipelines.registration
+        source = thinned_cloud(model.points, model.normals, self.features, model.diameter)
+        described = fpfh_features(source, self.features, model.diameter)
+        gate = self.gate_voxels * self.features.voxel * model.diameter
+        option = registration.FastGlobalRegistrationOption(maximum_correspondence_distance=gate)
+
+        def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
+            open3d.utility.random.seed(case.random_seed % 2**31)
+            target = thinned_cloud(case.points, None, self.features, model.diameter)
+            if len(target.points) < 10:
+                return None
+            found = registration.registration_fgr_based_on_feature_matching(
+                source, target, described, fpfh_features(target, self.features, model.diameter), option
+            )
+            return np.array(found.transformation)
+
+        return solve
+
+
+@dataclass(frozen=True)
+class PointPairs:
+    """Point pair features and voting (OpenCV's ppf_match_3d); the best pose is taken."""
+
+    name: str = "PPF"
+    sampling: float = 0.05  # of model and votes' distances
+    scene_share: float = 0.2  # of the scene's points are reference points
+    features: FeatureSettings = FeatureSettings()
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """All of them."""
+        return asdict(self)
+
+    def prepare(self, model: ObjectModel) -> Solver:
+        """Hash the model's pairs; solving samples and votes."""
+        import cv2
+
+        detector = cv2.ppf_match_3d.PPF3DDetector(self.sampling, self.sampling)
+        detector.trainModel(np.concatenate([model.points, model.normals], axis=1).astype(np.float32))
+
+        def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
+            target = thinned_cloud(case.points, None, self.features, model.diameter)
+            # Relative to the seed: floats of millimetres far from the sensor would lose digits.
+            offsets = np.asarray(target.points) - case.points[0]
+            cloud = np.concatenate([offsets, np.asarray(target.normals)], axis=1).astype(np.float32)
+            if len(cloud) < 10:
+                return None
+            found = detector.match(cloud, self.scene_share, self.sampling)
+            if not len(found):
+                return None
+            pose = np.array(found[0].pose, dtype=np.float64)
+            pose[:3, 3] += case.points[0]
+            return pose if np.isfinite(pose).all() else None
+
+        return solve
+
+
+@dataclass(frozen=True)
+class Kiss:
+    """KISS-Matcher: FPFH of its own, pruning by maximum cliques, graduated non-convexity."""
+
+    name: str = "KISS-Matcher"
+    voxel: float = 0.025
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """All of them; the rest are the package's defaults, multiples of the voxel."""
+        return asdict(self)
+
+    def prepare(self, model: ObjectModel) -> Solver:
+        """Return a solver that describes both clouds each time: the package keeps nothing."""
+        import kiss_matcher
+
+        # In diameters: the package takes bounds on noise above 1 for mistakes.
+        settings = kiss_matcher.KISSMatcherConfig(self.voxel)
+        source = (model.points / model.diameter).astype(np.float32)
+
+        def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
+            matcher = kiss_matcher.KISSMatcher(settings)
+            target = ((case.points - case.points[0]) / model.diameter).astype(np.float32)
+            found = matcher.estimate(source, target)
+            pose = np.eye(4)
+            pose[:3, :3] = np.array(found.rotation)
+            pose[:3, 3] = np.array(found.translation).reshape(3) * model.diameter + case.points[0]
+            return pose if np.isfinite(pose).all() else None
+
+        return solve
+
+
+@dataclass(frozen=True)
+class OverMatches:
+    """Open3D's RANSAC over our network's matches, as published for CPUs but for its own ICP."""
+
+    iterations: int = 5000
+    gate: float = 0.06  # published: 5 mm for parts of about 8 cm
+    confidence: float = 0.999
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """All of them."""
+        return {"library": "open3d", **asdict(self)}
+
+    def __call__(self, matches: Matches, diameter: float, seed: int) -> Float[np.ndarray, "4 4"] | None:
+        """Return the best pose; None if there are too few matches."""
+        open3d = quiet_open3d()
+        registration = open3d.pipelines.registration
+        open3d.utility.random.seed(seed % 2**31)
+        rows = np.flatnonzero(matches.mask)
+        if len(rows) < 3:
+            return None
+        clouds = (np.asarray(points)[rows] for points in (matches.object_points, matches.scene_points))
+        source, target = (open3d.geometry.PointCloud(_vectors(points)) for points in clouds)
+        pairs = open3d.utility.Vector2iVector(np.stack([np.arange(len(rows))] * 2, axis=1).astype(np.int32))
+        found = registration.registration_ransac_based_on_correspondence(
+            source,
+            target,
+            pairs,
+            self.gate * diameter,
+            registration.TransformationEstimationPointToPoint(False),
+            3,
+            [],
+            registration.RANSACConvergenceCriteria(self.iterations, self.confidence),
+        )
+        return np.array(found.transformation) if len(found.correspondence_set) else None
+
+
+def quiet_open3d() -> Any:
+    """Return the package, which otherwise warns at every crop that has few mutual matches."""
+    import open3d
+
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
+    return open3d
+
+
+def missing(module: str) -> str | None:
+    """Return why a package cannot be used, in one line; None if it can."""
+    try:
+        import_module(module)
+    except Exception as error:  # an extension module may fail in any way
+        return f"{module} cannot be imported ({str(error).splitlines()[0] if str(error) else type(error).__name__})"
+    return None
+
+
+RIVALS: Mapping[str, tuple[str, Callable[[], Any]]] = {
+    "fpfh": ("open3d", Fpfh),
+    "fgr": ("open3d", FastGlobal),
+    "ppf": ("cv2.ppf_match_3d", PointPairs),
+    "kiss": ("kiss_matcher", Kiss),
+}
+
+
+def _vectors(points: Float[np.ndarray, "n 3"]) -> Any:
+    import open3d
+
+    return open3d.utility.Vector3dVector(points.astype(np.float64))
+
+
+def thinned_cloud(
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"] | None,
+    settings: FeatureSettings,
+    diameter: float,
+) -> Any:
+    """Return a thinned cloud with normals; those of a scan are estimated after thinning and look at the camera."""
+    import open3d
+
+    voxel = settings.voxel * diameter
+    cloud = open3d.geometry.PointCloud(_vectors(points))
+    if normals is not None:
+        cloud.normals = _vectors(normals)
+        return cloud.voxel_down_sample(voxel)
+    cloud = cloud.voxel_down_sample(voxel)
+    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamHybrid(radius=settings.normal_voxels * voxel, max_nn=30))
+    cloud.orient_normals_towards_camera_location(np.zeros(3))
+    return cloud
+
+
+def fpfh_features(cloud: Any, settings: FeatureSettings, diameter: float) -> Any:
+    import open3d
+
+    radius = settings.feature_voxels * settings.voxel * diameter
+    search = open3d.geometry.KDTreeSearchParamHybrid(radius=radius, max_nn=100)
+    return open3d.pipelines.registration.compute_fpfh_feature(cloud, search)

@@ -1,0 +1,155 @@
+"""From predictions to recall under both gates, its intervals, and times."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from experiments.evaluation.predictions import Export, Predictions, Truth
+from kmn_jax.data.cad import ObjectModel
+from kmn_jax.pose import adi
+
+THRESHOLD = 0.1  # of the object's size
+_POINTS = 1000  # of an object's surface, for errors
+_REACH = 0.8  # diameters: copies whose centres are farther from the pose's are not near enough to be right
+_Z = 1.959964  # of a normal distribution's middle 95%
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One method on one object at one noise, or on several together."""
+
+    method: str
+    object: str
+    noise: float
+    errors: Float[np.ndarray, " c"]  # ADI to the nearest copy, in diameters; infinite where no pose was found
+    diagonal: Float[np.ndarray, " c"]  # of the object's bounding box, in diameters
+    seconds: Float[np.ndarray, " c"]
+
+    def recall(self, gate: str = "diameter") -> float:
+        """Return the share of right poses: ADI below a tenth of the diameter, or of the diagonal."""
+        return float(self._right(gate).mean()) if len(self.errors) else float("nan")
+
+    def interval(self, gate: str = "diameter") -> tuple[float, float]:
+        """Return Wilson's 95% interval of the recall."""
+        return wilson(int(self._right(gate).sum()), len(self.errors))
+
+    def _right(self, gate: str) -> np.ndarray:
+        size = self.diagonal if gate == "diagonal" else np.ones_like(self.errors)
+        return self.errors < THRESHOLD * size
+
+
+def wilson(right: int, total: int) -> tuple[float, float]:
+    """Return the 95% interval of a share after so many trials (Wilson, 1927); (0, 1) without any."""
+    if total == 0:
+        return 0.0, 1.0
+    share, spread = right / total, _Z**2 / total
+    middle = (share + spread / 2) / (1 + spread)
+    half = _Z * np.sqrt(share * (1 - share) / total + spread / (4 * total)) / (1 + spread)
+    # The share itself is inside, whatever rounding does at 0 and 1.
+    return max(min(float(middle - half), share), 0.0), min(max(float(middle + half), share), 1.0)
+
+
+def pooled(cells: Sequence[Cell], name: str) -> Cell:
+    """Return cells of one method and noise as one."""
+    first = cells[0]
+    columns = [np.concatenate([getattr(cell, field) for cell in cells]) for field in ("errors", "diagonal", "seconds")]
+    return Cell(first.method, name, first.noise, *columns)
+
+
+def cells_of(
+    folder: Export, models: Mapping[str, ObjectModel], methods: Mapping[str, str], noises: Sequence[float]
+) -> list[Cell]:
+    """Score all predictions: each method as it is, and with the refinement that all share."""
+    cells = []
+    for name, model in models.items():
+        for noise in noises:
+            truth = folder.truth(name, noise)
+            for key, title in methods.items():
+                found = folder.read(key, name, noise)
+                coarse, refined = (
+                    _errors(poses, found, truth, model) for poses in (found.T_camera_object, found.refined)
+                )
+                size = np.full(len(coarse), model.diagonal / model.diameter)
+                cells.append(Cell(title, name, noise, coarse, size, found.seconds))
+                total = found.seconds + found.refine_seconds
+                cells.append(Cell(f"{title} + ICP", name, noise, refined, size, total))
+    return cells
+
+
+def case_errors(folder: Export, name: str, noise: float, method: str, model: ObjectModel) -> Float[np.ndarray, " c"]:
+    """Return the errors of refined poses, case by case."""
+    found = folder.read(method, name, noise)
+    return _errors(found.refined, found, folder.truth(name, noise), model)
+
+
+def _errors(
+    poses: Float[np.ndarray, "c 4 4"], found: Predictions, truth: Truth, model: ObjectModel
+) -> Float[np.ndarray, " c"]:
+    """Return the ADI of each pose to the nearest copy of its scan, in diameters."""
+    middle = np.append((model.minimum + model.maximum) / 2, 1)
+    pairs, rows = [], []
+    for row, (pose, copies) in enumerate(zip(poses, truth.T_camera_object, strict=True)):
+        if not found.found[row]:
+            continue
+        away = np.linalg.norm((copies @ middle - pose @ middle)[:, :3], axis=1)
+        near = copies[away <= _REACH * model.diameter]
+        pairs += [np.stack([pose, copy]) for copy in near]
+        rows += [row] * len(near)
+    errors = np.full(len(poses), np.inf)
+    if pairs:
+        np.minimum.at(errors, rows, _adi(np.stack(pairs), model) / model.diameter)
+    return errors
+
+
+def _adi(pairs: Float[np.ndarray, "p 2 4 4"], model: ObjectModel) -> Float[np.ndarray, " p"]:
+    capacity = 1 << max(len(pairs) - 1, 0).bit_length()
+    origin = pairs[:, :1, :3, 3].copy()  # float32 of millimetres far from the camera would lose digits
+    near = pairs.copy()
+    near[:, :, :3, 3] -= origin
+    padded = np.concatenate([near, np.tile(np.eye(4), (capacity - len(pairs), 2, 1, 1))]).astype(np.float32)
+    return np.asarray(_adi_of_pairs(padded, jnp.asarray(model.points[:_POINTS], dtype=jnp.float32)))[: len(pairs)]
+
+
+@jax.jit
+def _adi_of_pairs(pairs: jax.Array, points: jax.Array) -> jax.Array:
+    return jax.lax.map(lambda pair: adi(pair[0], pair[1], points), pairs)
+
+
+def recall_rows(cells: Sequence[Cell], objects: str) -> list[dict[str, Any]]:
+    """Return a table's rows: for each method, the recall of all objects together at each noise, and times."""
+    rows = []
+    for method in dict.fromkeys(cell.method for cell in cells):
+        own = [cell for cell in cells if cell.method == method]
+        row: dict[str, Any] = {"method": method}
+        for noise in dict.fromkeys(cell.noise for cell in own):
+            whole = pooled([cell for cell in own if cell.noise == noise], objects)
+            row[f"noise {noise:.0%}"] = cell_text(whole, "diameter")
+            row[f"noise {noise:.0%}, by diagonal"] = f"{whole.recall('diagonal'):.2f}"
+        everything = np.concatenate([cell.seconds for cell in own])
+        row["mean ms"] = float(everything.mean() * 1e3) if len(everything) else None
+        row["median ms"] = float(np.median(everything) * 1e3) if len(everything) else None
+        row["crops"] = len(everything)
+        rows.append(row)
+    return rows
+
+
+def object_rows(cells: Sequence[Cell], noise: float) -> list[dict[str, Any]]:
+    """Return a table's rows: for each object, the recall of each method at one noise."""
+    rows = []
+    for name in dict.fromkeys(cell.object for cell in cells):
+        own = [cell for cell in cells if cell.object == name and cell.noise == noise]
+        rows.append({"object": name, **{cell.method: cell_text(cell, "diameter") for cell in own}})
+    return rows
+
+
+def cell_text(cell: Cell, gate: str) -> str:
+    """Return a recall with its interval, in two digits."""
+    low, high = cell.interval(gate)
+    return f"{cell.recall(gate):.2f} ({low:.2f}-{high:.2f})"

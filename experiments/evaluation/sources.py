@@ -1,0 +1,167 @@
+"""Where scans of known poses come from: BOP datasets, folders of clouds with poses, and our own ray-cast bins."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from experiments.evaluation.cases import UNIT, Image, ObjectImages
+from experiments.evaluation.clouds import camera_of, mesh_of, scans_with_poses
+from kmn_jax.checks import InputError
+from kmn_jax.data.background import bin_content
+from kmn_jax.data.bop import BopDataset, BopFrame, FrameKey
+from kmn_jax.data.bop_crops import load_models
+from kmn_jax.data.bop_models import NAMES_FILE
+from kmn_jax.data.cad import ObjectConfig, ObjectModel, load_object
+from kmn_jax.data.foreground import foreground
+from kmn_jax.data.mesh_files import METRES
+from kmn_jax.data.scan_files import Scan, read_scan
+from kmn_jax.data.scene import measured_points
+from kmn_jax.estimator.view import view_of
+
+OBJECT = ObjectConfig(num_points=4096)
+Report = Callable[[str], None]
+_Item = TypeVar("_Item")
+
+
+def bop_objects(folder: Path, split: str, report: Report, most_images: int | None = None) -> list[ObjectImages]:
+    """Return the objects of a BOP dataset with their images, or so many, evenly spread; all copies of one image count.
+
+    What is broken (no ground truth, a depth image of another size, an unknown object, an empty scene) is reported and
+    left out. Raises InputError if nothing can be used.
+    """
+    dataset = BopDataset.open(folder, split, unit=UNIT)
+    models, problems = load_models(dataset, OBJECT)
+    for problem in (*problems, *map(str, dataset.problems(decode=False))):
+        report(problem)
+    keys: dict[int, list[FrameKey]] = {object_id: [] for object_id in models}
+    for key in dataset.usable(decode=False):
+        try:
+            frame = dataset.frame(*key)
+        except InputError as error:
+            report(str(error))
+            continue
+        present = {instance.object_id for instance in frame.instances or ()}
+        if not present:
+            report(f"{folder.name}: image {key.image_id} of scene {key.scene_id} shows no object")
+        for object_id in sorted(present & set(models)):
+            keys[object_id].append(key)
+    names = _names(folder)
+    found = [
+        ObjectImages(
+            names.get(object_id, f"object {object_id}"),
+            model,
+            BopImages(dataset, model, object_id, tuple(_spread(keys[object_id], most_images)), report),
+        )
+        for object_id, model in models.items()
+        if keys[object_id]
+    ]
+    if not found:
+        raise InputError(f"{folder} has no image that can be evaluated: see what was reported, or its models")
+    return found
+
+
+@dataclass(frozen=True)
+class BopImages:
+    """The images of a BOP dataset that show an object."""
+
+    dataset: BopDataset
+    model: ObjectModel
+    object_id: int
+    keys: tuple[FrameKey, ...]
+    report: Report
+
+    def __iter__(self) -> Iterator[Image]:
+        for key in self.keys:
+            try:
+                frame = self.dataset.frame(*key, masks=True).with_visibility()
+                yield self._image(key, frame)
+            except InputError as error:
+                self.report(str(error))
+
+    def _image(self, key: FrameKey, frame: BopFrame) -> Image:
+        copies = [instance for instance in frame.instances or () if instance.object_id == self.object_id]
+        points = measured_points(frame.depth, frame.camera)
+        return Image(
+            f"{key.scene_id}/{key.image_id}",
+            points,
+            _content(frame, points, self.model.diameter),
+            np.stack([copy.T_camera_object for copy in copies]),
+            np.array([np.nan if copy.visible_fraction is None else copy.visible_fraction for copy in copies]),
+        )
+
+
+@dataclass(frozen=True)
+class CloudImages:
+    """Clouds of one object with the poses of its copies, in files beside each other."""
+
+    model: ObjectModel
+    files: tuple[tuple[Path, Float[np.ndarray, "i 4 4"]], ...]
+    camera: Path | None
+    unit: str  # of clouds, poses and sensor, as of the CAD file
+    sensor: Float[np.ndarray, "3"] | None  # in the clouds' frame; the origin unless given
+    report: Report
+
+    def __iter__(self) -> Iterator[Image]:
+        for path, poses in self.files:
+            try:
+                yield self._image(path, poses)
+            except InputError as error:
+                self.report(str(error))
+
+    def _image(self, path: Path, poses: Float[np.ndarray, "i 4 4"]) -> Image:
+        scale = METRES[self.unit] / METRES[UNIT]
+        scan = read_scan(path, self.unit, self.camera).in_unit(UNIT)
+        view = view_of(scan, None if self.sensor is None else self.sensor * scale)
+        scaled = poses.copy()
+        scaled[:, :3, 3] *= scale
+        front, _ = foreground(Scan(view.points, None, None, None, UNIT), self.model.diameter)
+        T_view_object = np.linalg.inv(view.T_scene_view) @ scaled
+        return Image(path.name, view.points, front, T_view_object, np.full(len(poses), np.nan))
+
+
+def cloud_objects(
+    folder: Path,
+    cad: Path | None,
+    camera: Path | None,
+    unit: str,
+    sensor: Float[np.ndarray, "3"] | None,
+    report: Report,
+    most_images: int | None = None,
+) -> list[ObjectImages]:
+    """Return the object of a folder of scans with poses; see `clouds`. Lengths are in `unit`, those of the CAD too."""
+    files = scans_with_poses(folder, cad)
+    path = cad or mesh_of(folder)
+    model = load_object(path, unit, OBJECT).in_unit(UNIT)
+    images = CloudImages(model, tuple(_spread(files, most_images)), camera or camera_of(folder), unit, sensor, report)
+    return [ObjectImages(path.stem, model, images)]
+
+
+def _content(frame: BopFrame, points: Float32[np.ndarray, "n 3"], diameter: float) -> Bool[np.ndarray, " n"]:
+    """Return which points may show parts: what is inside of the bin if that is known, else off floor and walls."""
+    if frame.bin is not None and frame.T_camera_bin is not None:
+        content = np.asarray(bin_content(frame.depth, frame.camera, frame.T_camera_bin, frame.bin, diameter))
+        inside = content[frame.depth > 0]
+    else:
+        inside, _ = foreground(Scan(points, None, None, None, UNIT), diameter)
+    return inside if inside.any() else np.ones_like(inside)
+
+
+def _spread(items: list[_Item], most: int | None) -> list[_Item]:
+    count = len(items) if most is None else min(most, len(items))
+    return [items[row * len(items) // count] for row in range(count)]
+
+
+def _names(folder: Path) -> dict[int, str]:
+    """Return what the dataset calls its objects."""
+    path = folder / "models" / NAMES_FILE
+    try:
+        return {int(key): str(name) for key, name in json.loads(path.read_text(encoding="utf-8")).items()}
+    except (OSError, ValueError, AttributeError):
+        return {}

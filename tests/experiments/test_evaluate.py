@@ -1,0 +1,203 @@
+"""The evaluation as it is run: on the small test set, on broken copies of it, on clouds, with a rival missing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import evaluate
+from experiments.evaluation.cases import Case, ObjectImages, draw_cases
+from experiments.evaluation.configs import EvaluateConfig
+from experiments.evaluation.rivals import RIVALS, FastGlobal, Fpfh, Kiss, PointPairs, missing
+from experiments.evaluation.sources import bop_objects, cloud_objects
+from kmn_jax.checks import InputError
+from kmn_jax.pose import adi
+from tests.data.bop_sample import save_image
+
+SMALL = Path(evaluate.__file__).parent / "assets" / "small_test_set"
+GEAR, IMAGES = "gear_motor", "2"
+
+
+@pytest.fixture(scope="module")
+def gear() -> ObjectImages:
+    problems: list[str] = []
+    found = bop_objects(SMALL, "test", problems.append, most_images=2)
+    assert not problems
+    return found[1]
+
+
+def test_cases_lie_on_copies_and_are_the_same_whenever_they_are_drawn(gear: ObjectImages) -> None:
+    cases, again = (list(draw_cases(gear, 6, 0.0)) for _ in range(2))
+    assert len(cases) == 6
+    for case, other in zip(cases, again, strict=True):
+        np.testing.assert_array_equal(case.points, other.points)
+        pose = case.T_camera_object[case.copy]
+        local = (case.points[0] - pose[:3, 3]) @ pose[:3, :3]
+        assert np.linalg.norm(gear.model.points - local, axis=1).min() < 0.05 * gear.model.diameter
+        reach = np.linalg.norm(case.points - case.points[0], axis=1)
+        assert reach.max() <= gear.model.diameter * (1 + 1e-5)
+
+
+def test_noise_is_a_share_of_the_longest_side_and_keeps_the_seeds(gear: ObjectImages) -> None:
+    plain, noisy = (list(draw_cases(gear, 4, noise)) for noise in (0.0, 0.05))
+    longest = float((gear.model.maximum - gear.model.minimum).max())
+    for one, other in zip(plain, noisy, strict=True):
+        assert one.name == other.name
+        assert (other.points - one.points).std() == pytest.approx(0.05 * longest, rel=0.05)
+
+
+def test_more_crops_than_scans_are_spread_evenly(gear: ObjectImages) -> None:
+    names = [case.name.rpartition("/")[0] for case in draw_cases(gear, 7, 0.0)]
+    assert sorted(names.count(name) for name in set(names)) == [3, 4]
+
+
+@pytest.mark.parametrize("kind", [Fpfh, FastGlobal, Kiss, PointPairs])
+def test_rivals_find_a_part_that_lies_there_alone(gear: ObjectImages, kind: type) -> None:
+    """Each gets the side of the part that a camera sees, and nothing else."""
+    pose = next(draw_cases(gear, 1, 0.0)).T_camera_object[0]
+    points = gear.model.points @ pose[:3, :3].T + pose[:3, 3]
+    seen = points[((gear.model.normals @ pose[:3, :3].T) * points).sum(axis=1) < 0].astype(np.float32)
+    method = kind(sampling=0.1) if kind is PointPairs else kind()
+    solve = method.prepare(gear.model)
+    found = [solve(Case(f"alone/{number}", seen, pose[None], 0, 1.0)) for number in range(3)]
+    right = [
+        one is not None and float(adi(one, pose, gear.model.points[:1000])) < 0.1 * gear.model.diameter for one in found
+    ]
+    assert sum(right) >= 2
+
+
+def test_a_package_that_is_missing_or_broken_is_told_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "broken_rival.py").write_text("raise OSError('libX.so: cannot open\\nmore')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert missing("json") is None
+    assert missing("no_such_rival") == "no_such_rival cannot be imported (No module named 'no_such_rival')"
+    assert missing("broken_rival") == "broken_rival cannot be imported (libX.so: cannot open)"
+
+
+def test_evaluating_twice_gives_the_same_numbers_and_a_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(RIVALS, "kiss", ("no_such_rival", Kiss))  # type: ignore[index]
+    options = ["--objects", GEAR, "--images", IMAGES, "--crops", "4", "--methods", "ours", "fpfh", "kiss"]
+    scores = []
+    for folder in ("one", "two"):
+        assert evaluate.main(["demo", *options, "--output", str(tmp_path / folder)]) == 0
+        content = json.loads((tmp_path / folder / "scores.json").read_text())
+        scores.append([{key: cell[key] for key in ("method", "noise", "crops", "recall")} for cell in content["cells"]])
+    assert scores[0] == scores[1]
+    assert [cell["method"] for cell in scores[0]] == [
+        "kmn_jax",
+        "kmn_jax + ICP",
+        "FPFH + RANSAC",
+        "FPFH + RANSAC + ICP",
+    ]
+    assert scores[0][1]["recall"]["diameter"] >= 0.5
+    assert "skipped kiss: no_such_rival cannot be imported" in capsys.readouterr().err
+
+    page = (tmp_path / "one" / "report.html").read_text()
+    assert page.count('src="data:image/png;base64,') == 2
+    assert "http" not in page.replace("http-equiv", "")
+    report = (tmp_path / "one" / "report.md").read_text()
+    for text in (page, report):
+        assert "FPFH + RANSAC + ICP" in text
+        assert "kiss: no_such_rival cannot be imported" in text
+
+    stamp = (tmp_path / "one" / "ours" / f"{GEAR}.noise0.safetensors").stat().st_mtime_ns
+    assert evaluate.main(["demo", *options, "--output", str(tmp_path / "one")]) == 0
+    assert (tmp_path / "one" / "ours" / f"{GEAR}.noise0.safetensors").stat().st_mtime_ns == stamp  # not made anew
+    assert evaluate.main(["demo", *options, "--seed", "1", "--output", str(tmp_path / "one")]) == 2
+    assert "differing: config" in capsys.readouterr().err
+
+
+def test_broken_scenes_are_reported_and_the_rest_is_read(tmp_path: Path) -> None:
+    folder = tmp_path / "broken"
+    shutil.copytree(SMALL, folder)
+    usb, gears = folder / "test" / "000001", folder / "test" / "000002"
+    for number, scene in enumerate((usb, gears), start=3):
+        shutil.copytree(scene, folder / "test" / f"{number:06d}")
+    (usb / "scene_gt.json").unlink()
+    depth = sorted((gears / "depth").glob("*.png"))
+    save_image(depth[0], np.zeros((10, 10), dtype=np.uint16))
+    truth = json.loads((folder / "test" / "000004" / "scene_gt.json").read_text())
+    images = sorted(truth, key=int)
+    for instance in truth[images[0]]:
+        instance["obj_id"] = 77
+    truth[images[1]] = []
+    (folder / "test" / "000004" / "scene_gt.json").write_text(json.dumps(truth))
+    for name in ("mask", "mask_visib"):
+        shutil.rmtree(folder / "test" / "000004" / name, ignore_errors=True)
+    (folder / "test" / "000004" / "scene_gt_info.json").unlink(missing_ok=True)
+
+    problems: list[str] = []
+    found = bop_objects(folder, "test", problems.append)
+    told = "\n".join(problems)
+    assert "scene_gt.json" in told
+    assert depth[0].name in told
+    assert "shows no object" in told
+    assert "obj_id 77 has no model" in told
+    counts = {one.name: len(list(one.images)) for one in found}
+    whole = {one.name: len(list(one.images)) for one in bop_objects(SMALL, "test", problems.append)}
+    assert counts[GEAR] == 2 * whole[GEAR] - 3
+    assert sum(counts.values()) == sum(whole.values()) * 2 - 3 - whole[next(name for name in whole if name != GEAR)]
+    for one in found:
+        assert len(list(draw_cases(one, 5, 0.0))) == 5
+
+
+def test_clouds_with_poses_are_evaluated_from_their_sensor(tmp_path: Path, gear: ObjectImages) -> None:
+    """A scan in another frame than the sensor's, whose place is named."""
+    (image, *_) = gear.images
+    turn = np.eye(4)
+    turn[:3, :3], turn[:3, 3] = np.diag([1.0, -1, -1]), [10.0, 20.0, 700.0]
+    points = image.points @ turn[:3, :3].T + turn[:3, 3]
+    np.save(tmp_path / "scan1.npy", points.astype(np.float32))
+    poses = turn @ image.T_camera_object
+    (tmp_path / "scan1.txt").write_text("\n".join(" ".join(map(repr, row)) for pose in poses for row in pose.tolist()))
+    mesh = next((SMALL / "models").glob("obj_000002.*"))
+    shutil.copy(mesh, tmp_path / "part.ply")
+    problems: list[str] = []
+    (found,) = cloud_objects(tmp_path, tmp_path / "part.ply", None, "mm", turn[:3, 3], problems.append)
+    cases = list(draw_cases(found, 4, 0.0))
+    assert len(cases) == 4
+    for case in cases:
+        pose = case.T_camera_object[case.copy]
+        assert case.points[:, 2].min() > 0  # in front of the sensor
+        local = (case.points[0] - pose[:3, 3]) @ pose[:3, :3]
+        assert np.linalg.norm(found.model.points - local, axis=1).min() < 0.05 * found.model.diameter
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["electronic"], "did you mean electronics"),
+        (["bop"], "needs a folder"),
+        (["bop", "--folder", "no_such_folder"], "no_such_folder"),
+        (["clouds", "--folder", "no_such_folder"], "not a folder"),
+        (["demo", "--methods", "magic"], "no method 'magic'"),
+        (["demo", "--objects", "none"], "none of the objects is named none"),
+        (["demo", "--crops", "0"], "must be 1 or more"),
+        (["demo", "--noise", "2"], "noise"),
+        (["demo", "--weights", "none"], "none"),
+    ],
+)
+def test_bad_input_is_one_sentence(
+    arguments: list[str],
+    text: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert evaluate.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert text in error
+    assert "Traceback" not in error
+
+
+def test_settings_that_contradict_each_other_are_refused() -> None:
+    for values in ({"methods": ("fpfh", "fpfh")}, {"noise": ()}, {"images": 0}, {"sensor": "1,2"}, {"methods": ()}):
+        with pytest.raises(InputError):
+            EvaluateConfig("x", **values)  # type: ignore[arg-type]

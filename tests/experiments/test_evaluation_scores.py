@@ -1,0 +1,130 @@
+"""Recall, its intervals and the tables, on poses whose errors are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.evaluation.cases import Case
+from experiments.evaluation.predictions import Export, Predictions
+from experiments.evaluation.report import beaten_by
+from experiments.evaluation.scores import Cell, case_errors, cells_of, object_rows, pooled, recall_rows, wilson
+from kmn_jax.checks import InputError
+from kmn_jax.data.cad import ObjectModel
+from tests.data.bop_sample import box_model
+from tests.reference.poses import some_poses
+
+NOISE = 0.01
+
+
+def shifted(poses: np.ndarray, by: np.ndarray) -> np.ndarray:
+    moved = poses.copy()
+    moved[:, :3, 3] += by
+    return moved
+
+
+@pytest.fixture(scope="module")
+def model() -> ObjectModel:
+    return box_model()
+
+
+@pytest.fixture
+def exported(tmp_path: Path, model: ObjectModel) -> Export:
+    """Six cases: three right, one off by a quarter of the diameter, one on another copy, one without a pose."""
+    poses = some_poses(6, spread=5 * model.diameter)
+    others = shifted(poses, np.array([10 * model.diameter, 0, 0]))
+    points = np.zeros((60, 3), dtype=np.float32)
+    cases = [Case(f"1/{row}", points, np.stack([poses[row], others[row]]), 0, 1.0) for row in range(6)]
+    found = poses.copy()
+    found[3, :3, 3] += 0.25 * model.diameter * poses[3, :3, 2]
+    found[4] = others[4]
+    folder = Export.open(tmp_path / "out", {"config": 1}, overwrite=False)
+    folder.write_truth("box", NOISE, cases)
+    there = np.array([True, True, True, True, True, False])
+    seconds = np.linspace(0.1, 0.6, 6)
+    folder.write("ours", "box", NOISE, Predictions(found, poses, there, seconds, seconds))
+    return folder
+
+
+def test_a_pose_is_right_on_any_copy_and_only_within_the_gate(exported: Export, model: ObjectModel) -> None:
+    coarse, refined = cells_of(exported, {"box": model}, {"ours": "kmn_jax"}, [NOISE])
+    assert coarse.method == "kmn_jax"
+    assert refined.method == "kmn_jax + ICP"
+    assert np.isinf(coarse.errors[5])
+    np.testing.assert_allclose(coarse.errors[[0, 1, 2, 4]], 0, atol=1e-5)
+    assert coarse.errors[3] == pytest.approx(0.25, abs=1e-4)
+    assert coarse.recall() == pytest.approx(4 / 6)
+    assert refined.recall() == pytest.approx(5 / 6)
+    np.testing.assert_allclose(refined.seconds, 2 * coarse.seconds)
+    np.testing.assert_array_equal(case_errors(exported, "box", NOISE, "ours", model), refined.errors)
+
+
+def test_the_gate_by_the_diagonal_is_the_wider_one(model: ObjectModel) -> None:
+    cell = Cell("m", "o", 0.0, np.array([0.05, 0.105, 0.2]), np.full(3, 1.1), np.ones(3))
+    assert cell.recall("diameter") == pytest.approx(1 / 3)
+    assert cell.recall("diagonal") == pytest.approx(2 / 3)
+
+
+@pytest.mark.parametrize(
+    ("right", "total", "interval"),
+    [(5, 10, (0.2366, 0.7634)), (0, 10, (0.0, 0.2775)), (10, 10, (0.7225, 1.0)), (95, 100, (0.8882, 0.9785))],
+)
+def test_wilson_intervals(right: int, total: int, interval: tuple[float, float]) -> None:
+    np.testing.assert_allclose(wilson(right, total), interval, atol=1e-4)
+
+
+def test_an_interval_of_nothing_is_everything() -> None:
+    assert wilson(0, 0) == (0.0, 1.0)
+
+
+def cell(method: str, name: str, right: int, total: int = 100) -> Cell:
+    errors = np.where(np.arange(total) < right, 0.0, np.inf)
+    return Cell(method, name, 0.0, errors, np.ones(total), np.full(total, 0.01))
+
+
+def test_tables_and_where_others_find_more() -> None:
+    cells = [
+        cell("kmn_jax + ICP", "a", 80),
+        cell("FPFH", "a", 99),
+        cell("kmn_jax + ICP", "b", 90),
+        cell("FPFH", "b", 91),
+    ]
+    rows = recall_rows(cells, "all")
+    assert [row["method"] for row in rows] == ["kmn_jax + ICP", "FPFH"]
+    assert rows[0]["noise 0%"].startswith("0.85 (")
+    assert rows[0]["crops"] == 200
+    assert rows[0]["mean ms"] == pytest.approx(10)
+    assert [row["object"] for row in object_rows(cells, 0.0)] == ["a", "b"]
+    assert pooled([cells[0], cells[2]], "all").recall() == pytest.approx(0.85)
+    lines = beaten_by(cells, "kmn_jax + ICP")
+    assert len(lines) == 2
+    assert "beyond" in lines[0]
+    assert "within" in lines[1]
+
+
+def test_what_another_recipe_made_is_refused(tmp_path: Path, exported: Export, model: ObjectModel) -> None:
+    Export.open(tmp_path / "out", {"config": 1}, overwrite=False)
+    with pytest.raises(InputError, match="differing: config"):
+        Export.open(tmp_path / "out", {"config": 2}, overwrite=False)
+    assert exported.read("ours", "box", NOISE).found.sum() == 5  # nothing was lost
+    fresh = Export.open(tmp_path / "out", {"config": 2}, overwrite=True)
+    with pytest.raises(InputError, match=r"noise0\.01"):
+        fresh.read("ours", "box", NOISE)
+
+
+def test_a_file_of_another_recipe_or_none_is_refused(tmp_path: Path, exported: Export) -> None:
+    other = Export.open(tmp_path / "other", {"config": 2}, overwrite=False)
+    source = exported.path("ours", "box", NOISE)
+    target = other.path("ours", "box", NOISE)
+    target.parent.mkdir()
+    target.write_bytes(source.read_bytes())
+    with pytest.raises(InputError, match="another recipe"):
+        other.read("ours", "box", NOISE)
+    target.write_bytes(source.read_bytes()[:100])
+    with pytest.raises(InputError, match="box"):
+        other.read("ours", "box", NOISE)
+    (tmp_path / "other" / "recipe.json").write_text("{")
+    with pytest.raises(InputError, match=r"recipe\.json"):
+        Export.open(tmp_path / "other", {"config": 2}, overwrite=False)
