@@ -51,7 +51,7 @@ class Request:
     plane: Literal["auto", "always", "never"] = "auto"
     """Whether to leave out the largest plane, what is behind it, and a bin's walls; auto: if larger than the object."""
     thorough: bool = False
-    """Search on where nothing was found, for a few more copies in a few times as long."""
+    """Search on where nothing was found: takes longer in full bins, and finds a few copies more."""
     sensor: str | None = None
     """X,Y,Z of the sensor in the scene's frame; the origin unless given."""
     weights: str = "small"

@@ -18,7 +18,7 @@ from kmn_jax.data.background import away_from_empty, in_front_of_empty
 from kmn_jax.data.mesh_files import METRES
 from kmn_jax.data.planes import Plane, dominant_plane, extent
 from kmn_jax.data.scan_files import Scan
-from kmn_jax.data.walls import off_walls
+from kmn_jax.data.walls import Ground, off_walls
 
 RemovePlane = Literal["auto", "always", "never"]
 Box = tuple[float, float, float, float, float, float]
@@ -88,18 +88,21 @@ def foreground(
             raise InputError(f"all {before} points are those of the empty bin, or too near to it: is it really empty?")
     wanted = options.remove_plane == "always" or (options.remove_plane == "auto" and options.background is None)
     if wanted:
-        chosen = np.flatnonzero(kept)
-        floor, warning = _floor(scan.points[chosen], diameter, options)
+        chosen, margin = np.flatnonzero(kept), options.plane_margin * diameter
+        floor, kept_plane, warning = _floor(scan.points[chosen], diameter, options)
+        ground = None if kept_plane is None else Ground(kept_plane, np.zeros((0, 3), dtype=np.float32))
         if floor is not None:
-            kept[chosen] = floor.height(scan.points[chosen]) < -options.plane_margin * diameter
+            height = floor.height(scan.points[chosen])
+            ground = Ground(floor, scan.points[chosen][np.abs(height) <= margin])
+            kept[chosen] = height < -margin
             if not kept.any():
                 raise InputError(
                     f"all {len(chosen)} points lie in one plane or behind it: if they show parts, keep the plane"
                 )
         warnings += [warning] if warning else []
         chosen = np.flatnonzero(kept)
-        margin, least_extent = options.plane_margin * diameter, options.least_extent * diameter
-        kept[chosen] = off_walls(scan.points[chosen], floor, margin, least_extent, options.seed)
+        least_extent = options.least_extent * diameter
+        kept[chosen] = off_walls(scan.points[chosen], ground, floor is not None, margin, least_extent, options.seed)
     return kept, tuple(warnings)
 
 
@@ -119,13 +122,14 @@ def _off_background(scan: Scan, empty: Scan, diameter: float, margin: float) -> 
 
 def _floor(
     points: Float32[np.ndarray, "n 3"], diameter: float, options: ForegroundOptions
-) -> tuple[Plane | None, str | None]:
-    """Return the plane to take away, or none, and what may make a user wonder.
+) -> tuple[Plane | None, Plane | None, str | None]:
+    """Return the plane to take away, or none, the first that was kept, and what may make a user wonder.
 
     The largest plane may be the tops of a layer of parts. Then the floor is the largest plane behind it.
     """
     margin = options.plane_margin * diameter
-    searched, kept_plane = points, None
+    searched, kept = points, None
+    kept_text: str | None = None
     for _ in range(_PLANES):
         plane = dominant_plane(searched, margin, options.seed)
         if plane is None:
@@ -135,18 +139,17 @@ def _floor(
         share, behind, before = (float(part.mean()) for part in (within, height > margin, height < -margin))
         if options.remove_plane == "always":
             weak = f"the largest plane was taken away as asked, though it holds only {share:.0%} of the points"
-            return plane, weak if share < options.least_share else None
+            return plane, None, weak if share < options.least_share else None
         if share < options.least_share or extent(points[within]) <= options.least_extent * diameter:
             break
         if behind <= _BEHIND and before < _LEFT:
-            return None, (
-                f"a plane with {share:.0%} of the points was kept, as only {before:.1%} lie in front of it: if it is"
-                " the floor, have it always removed"
-            )
+            text = f"a plane with {share:.0%} of the points was kept, as only {before:.1%} lie in front of it: if it"
+            return None, plane, f"{text} is the floor, have it always removed"
         if behind <= _BEHIND:
-            return plane, kept_plane and f"{kept_plane} was kept, in front of the one that was taken away{_HINT}"
-        kept_plane = kept_plane or (f"a plane with {share:.0%} of the points" if share > behind else None)
+            return plane, kept, kept_text and f"{kept_text} was kept, in front of the one that was taken away{_HINT}"
+        kept = kept or plane
+        kept_text = kept_text or (f"a plane with {share:.0%} of the points" if share > behind else None)
         searched = points[height > margin]
     if options.remove_plane == "always":
-        return None, "no plane was taken away, as none was found"
-    return None, kept_plane and f"{kept_plane} was kept, as many lie behind it{_HINT}"
+        return None, None, "no plane was taken away, as none was found"
+    return None, kept, kept_text and f"{kept_text} was kept, as many lie behind it{_HINT}"

@@ -153,8 +153,12 @@ class PoseEstimator:
             scene = scan
         else:
             with clock("scene"):
-                smallest = min(parts, key=lambda one: one.in_unit("m").diameter)
-                scene = self.scene(scan, smallest, at=places, **options)
+                smallest, *_, largest = sorted((*parts, parts[0]), key=lambda one: one.in_unit("m").diameter)
+                ratio = largest.in_unit("m").diameter / smallest.in_unit("m").diameter
+                planes = options.pop("background", None) or ForegroundOptions()
+                # Margins are those of the smallest part, but a plane is background only if it is no part's.
+                planes = replace(planes, least_extent=planes.least_extent * ratio)
+                scene = self.scene(scan, smallest, at=places, background=planes, **options)
         in_view = None if places is None else into(scene.view.T_scene_view, places)
         if in_view is not None:
             reach = max(one.in_unit(scene.unit).diameter for one in parts)

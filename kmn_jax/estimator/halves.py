@@ -17,7 +17,8 @@ def in_halves(function: Callable[..., _Result], *batch: Any) -> _Result:
 
     The leading axis of all leaves, in and out, is the batch's, of even length. XLA keeps little more than one core busy
     with items that come one after the other, so on CPUs two threads take every other item each: where only the first
-    ones are real, both have as many. The results are the same.
+    ones are real, both have as many. The results are the same. Contexts of JAX that hold for one thread only, such as
+    `jax.default_device`, do not reach them.
     """
     if jax.default_backend() != "cpu":
         return function(*batch)
