@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import sys
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
@@ -46,11 +47,21 @@ class Options:
 
 def evaluate(options: Options) -> Path:
     """Evaluate and return the path of the report's page."""
+    model = released_or_own(options.config.weights)
+    methods, skipped = _methods(options.config, model)
+    return compare(options, model, methods, skipped)
+
+
+def released_or_own(weights: str) -> Model:
+    """Load a released network by its name, or one's own by its file."""
+    path = Path(weights)
+    return load_model(path if path.suffix == ".safetensors" else released_file(weights))
+
+
+def compare(options: Options, model: Model, methods: Mapping[str, Method], skipped: Mapping[str, str]) -> Path:
+    """Run methods, score and report them; return the path of the report's page."""
     config = options.config
     folder = options.output or Path("outputs") / "evaluation" / config.name
-    path = Path(config.weights)
-    model = load_model(path if path.suffix == ".safetensors" else released_file(config.weights))
-    methods, skipped = _methods(config, model)
     problems: list[str] = []
     objects = _objects(config, problems)
     recipe = {
@@ -139,15 +150,20 @@ def _data_digest(config: EvaluateConfig) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Evaluate: 0 is success, 2 bad input, in one sentence on stderr."""
+    return run("evaluate", __doc__ or "", evaluate, arguments)
+
+
+def run(command: str, text: str, function: Callable[[Options], Path], arguments: list[str] | None) -> int:
+    """Run what reports on a named config: 0 is success, 2 bad input, in one sentence on stderr."""
     name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     try:
         if name.startswith("-"):
-            print(f"{__doc__}\nNames: {', '.join(CONFIGS)}. Fields: python -m experiments.evaluate NAME --help")
+            print(f"{text}\nNames: {', '.join(CONFIGS)}. Fields: python -m experiments.{command} NAME --help")
             return 0 if name in ("-h", "--help") else 2
         default = Options(find_config(name))
-        page = evaluate(tyro.cli(Options, default=default, args=rest, prog=f"experiments.evaluate {name}"))
+        page = function(tyro.cli(Options, default=default, args=rest, prog=f"experiments.{command} {name}"))
     except InputError as error:
-        print(f"evaluate: {error}", file=sys.stderr)
+        print(f"{command}: {error}", file=sys.stderr)
         return 2
     print(f"\nreport: {page}")
     return 0

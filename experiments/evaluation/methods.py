@@ -7,7 +7,7 @@ points of the crop, in the camera's frame, the seed first; and the object's poin
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
@@ -26,6 +26,7 @@ from kmn_jax.estimator.result import CropPrediction
 from kmn_jax.estimator.search import PartArrays, SceneArrays, as_visible
 from kmn_jax.estimator.view import padded_points
 from kmn_jax.models import Model
+from kmn_jax.models.keymatchnet import model_structure
 from kmn_jax.pose import MatchConfig, Matches, PoseResult, RansacConfig, find_matches, ransac
 from kmn_jax.typing import PRNGKey, Scalar
 
@@ -57,6 +58,8 @@ class OursConfig:
     ransac: RansacConfig = field(default_factory=RansacConfig)
     normal_radius: float = 0.06
     normal_points: int = 4096
+    num_points: int | None = None  # of a crop that the network sees; as many as it was made for unless given
+    num_keypoints: int | None = None
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,7 @@ class Ours:
 
     def prepare(self, model: ObjectModel) -> Solver:
         """Encode an object; solving covers drawing, normals, network, matches and search."""
-        arrays = arrays_of(self.model, make_part(model, self.model))
+        arrays = arrays_of(self.model, self.part(model))
 
         def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
             said = self._say(arrays, case)
@@ -90,6 +93,13 @@ class Ours:
             return _moved(np.asarray(found.T_scene_object), seed) if found.converged else None
 
         return solve
+
+    def part(self, model: ObjectModel) -> Part:
+        """Return an encoded object."""
+        config = self.model.config
+        count = self.config.num_keypoints or config.num_keypoints
+        structure = model_structure(replace(config, num_keypoints=count))
+        return make_part(model, Model(structure.graphdef, self.model.parameters))
 
     def predict(self, part: Part, case: Case) -> CropPrediction:
         """Return what the network says of a crop."""
@@ -107,7 +117,7 @@ class Ours:
             padded(case.points),
             jax.random.key(case.random_seed),
             self.config,
-            self.model.config.num_scene_points,
+            self.config.num_points or self.model.config.num_scene_points,
         )
 
 

@@ -13,7 +13,7 @@ from experiments.evaluation.cases import Case
 from experiments.evaluation.methods import Ours
 from experiments.evaluation.plots import as_png, new_figure
 from kmn_jax.data.cad import ObjectModel
-from kmn_jax.estimator.part import Part, make_part
+from kmn_jax.estimator.part import Part
 from kmn_jax.estimator.picture_legend import draw_part
 from kmn_jax.estimator.raster import distinct_colors
 from kmn_jax.estimator.result import Detection
@@ -45,7 +45,7 @@ def case_grid(method: Ours, shown: Sequence[Shown]) -> bytes:
 
 
 def _draw(row: Sequence[Any], method: Ours, one: Shown) -> None:
-    part = make_part(one.model, method.model)
+    part = method.part(one.model)
     draw_part(row[0], part, (0.5, 0.6, -0.62), one.model.name[:28])
     points = _thinned(one.case.points)
     shade = points[:, 2]

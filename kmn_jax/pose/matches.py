@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from math import log
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,12 +38,15 @@ class MatchConfig:
     """Choose which scores become matches. Vote threshold as published (arXiv 2303.16102, pose estimation)."""
 
     vote_threshold: float = 0.7  # a point votes for each keypoint that scores this share of its best one
+    softmax: Literal["keypoints", "points"] = "keypoints"  # along which scores are 1 in sum; the authors' code: points
     capacity: int = 4096  # matches kept at most, the most trusted ones
 
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
         if not 0 < self.vote_threshold <= 1:
             raise ValueError(f"vote_threshold is {self.vote_threshold}, but must be in (0, 1]")
+        if self.softmax not in ("keypoints", "points"):
+            raise ValueError(f"softmax is {self.softmax!r}, but must be 'keypoints' or 'points'")
         if self.capacity < 3:
             raise ValueError(f"capacity is {self.capacity}, but a pose needs at least 3 matches")
 
@@ -62,7 +65,8 @@ def find_matches(
     """Return the matches that segmentation logits (n, 2) and keypoint logits (n, k) vote for.
 
     A scene point whose object logit (column 1) exceeds its background logit (column 0) is matched with every
-    keypoint (k, 3) whose softmax score over the keypoints is at least `vote_threshold` times its best one. The
+    keypoint (k, 3) whose softmax score over the keypoints is at least `vote_threshold` times its best one (the paper's
+    rule; with `softmax` "points", scores are those over the points, as in the authors' code). The
     weight of a match is that score times the softmax score of the object class. Points where `mask` (n,) is
     false never vote; neither do, under a trace, points with values that are not finite, for which outside
     of one InputError is raised, as it is for wrong shapes and dtypes. No vote at all is a mask without a true.
@@ -104,10 +108,16 @@ def _find_matches(
     keypoint_logits = jnp.where(mask[:, None], keypoint_logits, 0)
 
     is_object = mask & (segmentation_logits[:, OBJECT_CLASS] > segmentation_logits[:, 1 - OBJECT_CLASS])
+    if config.softmax == "points":
+        keypoint_logits = jax.nn.log_softmax(jnp.where(mask[:, None], keypoint_logits, -jnp.inf), axis=0)
+        keypoint_logits = jnp.where(mask[:, None], keypoint_logits, 0)
+        keypoint_scores = jnp.exp(keypoint_logits)
+    else:
+        keypoint_scores = jax.nn.softmax(keypoint_logits, axis=1)
     # A ratio of softmax scores is a difference of logits.
     votes = keypoint_logits >= keypoint_logits.max(axis=1, keepdims=True) + log(config.vote_threshold)
     votes = votes & is_object[:, None]
-    scores = jax.nn.softmax(segmentation_logits, axis=1)[:, OBJECT_CLASS, None] * jax.nn.softmax(keypoint_logits, 1)
+    scores = jax.nn.softmax(segmentation_logits, axis=1)[:, OBJECT_CLASS, None] * keypoint_scores
 
     size = min(config.capacity, n * k)
     weights, flat = jax.lax.top_k(jnp.where(votes, scores, -1).reshape(-1), size)

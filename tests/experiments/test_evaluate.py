@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import evaluate
+from experiments import ablate, evaluate
 from experiments.evaluation.cases import Case, ObjectImages, draw_cases
 from experiments.evaluation.configs import EvaluateConfig
 from experiments.evaluation.rivals import RIVALS, FastGlobal, Fpfh, Kiss, PointPairs, missing
@@ -167,6 +167,20 @@ def test_clouds_with_poses_are_evaluated_from_their_sensor(tmp_path: Path, gear:
         assert case.points[:, 2].min() > 0  # in front of the sensor
         local = (case.points[0] - pose[:3, 3]) @ pose[:3, :3]
         assert np.linalg.norm(found.model.points - local, axis=1).min() < 0.05 * found.model.diameter
+
+
+def test_an_ablation_changes_one_choice_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen = {"10 keypoints": ablate.VARIANTS["10 keypoints"], "256 points": ablate.VARIANTS["256 points"]}
+    monkeypatch.setattr(ablate, "VARIANTS", chosen)
+    options = ["demo", "--objects", GEAR, "--images", "1", "--crops", "3", "--output", str(tmp_path / "out")]
+    assert ablate.main(options) == 0
+    content = json.loads((tmp_path / "out" / "scores.json").read_text())
+    assert {cell["method"] for cell in content["cells"]} == {
+        f"{name}{refined}" for name in ("kmn_jax", *chosen) for refined in ("", " + ICP")
+    }
+    settings = content["recipe"]["methods"]
+    assert settings["10_keypoints"]["num_keypoints"] == 10
+    assert settings["ours"]["num_keypoints"] is None
 
 
 @pytest.mark.parametrize(

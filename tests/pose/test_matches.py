@@ -16,26 +16,28 @@ def make_case(seed=0, n=N, k=K):
     return segmentation, keypoint, *clouds, 2.0
 
 
-def softmax(logits):
+def softmax(logits, axis=1):
     scores = np.exp(np.asarray(logits, np.float64))
-    return scores / scores.sum(axis=1, keepdims=True)
+    return scores / scores.sum(axis=axis, keepdims=True)
 
 
-def reference(case, threshold):
+def reference(case, threshold, axis=1):
     """All (point, keypoint, weight) votes in plain NumPy, best first."""
-    segmentation, keypoint = softmax(case[0]), softmax(case[1])
+    segmentation, keypoint = softmax(case[0]), softmax(case[1], axis)
     votes = keypoint >= threshold * keypoint.max(axis=1, keepdims=True)
     votes &= (segmentation[:, 1] > segmentation[:, 0])[:, None]
     found = [(i, j, segmentation[i, 1] * keypoint[i, j]) for i, j in np.argwhere(votes)]
     return sorted(found, key=lambda vote: -vote[2])
 
 
+@pytest.mark.parametrize(("softmax", "axis"), [("keypoints", 1), ("points", 0)])
 @pytest.mark.parametrize("threshold", [0.1, 0.7, 1.0])
 @pytest.mark.parametrize("seed", range(2))
-def test_against_numpy(seed, threshold):
+def test_against_numpy(seed, threshold, softmax, axis):
     case = make_case(seed)
-    matches = find_matches(*case, config=MatchConfig(vote_threshold=threshold, capacity=300))
-    expected = reference(case, threshold)
+    config = MatchConfig(vote_threshold=threshold, softmax=softmax, capacity=300)
+    matches = find_matches(*case, config=config)
+    expected = reference(case, threshold, axis)
     assert matches.mask.sum() == len(expected)
     assert not matches.overflow
     assert matches.mask.shape == (300,)
@@ -72,6 +74,19 @@ def test_nothing_segmented_gives_no_pose():
     result = ransac(jax.random.key(0), matches)
     assert result.status == PoseStatus.TOO_FEW_MATCHES
     np.testing.assert_array_equal(result.T_scene_object, np.eye(4))
+
+
+@pytest.mark.parametrize("softmax", ["keypoints", "points"])
+def test_points_that_are_not_real_change_nothing(softmax):
+    case, config = make_case(), MatchConfig(softmax=softmax)
+    few = [array[:30] for array in case[:4]]
+    alone = find_matches(*few, *case[4:], config=config)
+    masked = find_matches(*case, mask=np.arange(N) < 30, config=config)
+    for one, other in zip(alone, masked, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5)
+    nothing = find_matches(*case, mask=np.zeros(N, bool), config=config)
+    assert not nothing.mask.any()
+    assert np.isfinite(nothing.weights).all()
 
 
 def test_masked_points_never_vote():

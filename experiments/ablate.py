@@ -1,0 +1,53 @@
+"""What each choice of our pipeline is worth: `python -m experiments.ablate NAME`, a name of `experiments.evaluate`.
+
+One choice at a time is changed; recall and time as in an evaluation, under outputs/ablation/NAME. Not among them:
+input normalisation ("released" against "metric"), which a network has to be trained with.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from experiments.evaluate import Options, compare, released_or_own, run
+from experiments.evaluation.methods import Method, Ours, OursConfig
+from kmn_jax.models import Model
+from kmn_jax.pose import MatchConfig, RansacConfig
+
+VARIANTS = {
+    "10 keypoints": OursConfig(num_keypoints=10),
+    "40 keypoints": OursConfig(num_keypoints=40),
+    "vote threshold 0.5": OursConfig(matches=MatchConfig(vote_threshold=0.5)),
+    "vote threshold 0.9": OursConfig(matches=MatchConfig(vote_threshold=0.9)),
+    "softmax over points": OursConfig(matches=MatchConfig(softmax="points")),
+    "no normal check": OursConfig(ransac=RansacConfig(use_normals=False)),
+    "100 hypotheses": OursConfig(ransac=RansacConfig(num_hypotheses=100)),
+    "4000 hypotheses": OursConfig(ransac=RansacConfig(num_hypotheses=4000)),
+    "gate 0.1": OursConfig(ransac=RansacConfig(distance_gate=0.1)),
+    "256 points": OursConfig(num_points=256),
+    "1024 points": OursConfig(num_points=1024),
+    "normals of 0.12 diameters": OursConfig(normal_radius=0.12),
+}
+
+
+def methods_of(model: Model) -> dict[str, Method]:
+    """Return our pipeline as it is, and with one choice changed each."""
+    changed = {name.replace(" ", "_"): Ours(name, model, config) for name, config in VARIANTS.items()}
+    return {"ours": Ours("kmn_jax", model), **changed}
+
+
+def ablate(options: Options) -> Path:
+    """Compare all variants and return the path of the report's page."""
+    folder = options.output or Path("outputs") / "ablation" / options.config.name
+    model = released_or_own(options.config.weights)
+    return compare(replace(options, output=folder), model, methods_of(model), {})
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Ablate: 0 is success, 2 bad input, in one sentence on stderr."""
+    return run("ablate", __doc__ or "", ablate, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
