@@ -158,11 +158,13 @@ def export(
 
 
 def _solved(solve: Callable[[Case], Any], refine: Refinement, cases: Sequence[Case]) -> Predictions:
-    """Solve cases one after another; what is compiled or loaded the first time is not timed."""
+    """Solve cases one after another; what is compiled or loaded first, for each size of crops, is not timed."""
     if not cases:
         none = np.zeros(0)
         return Predictions(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), np.zeros(0, dtype=bool), none, none)
-    rows = [_timed(solve, refine, case) for case in (cases[0], *cases)][1:]
+    for case in {len(case.points).bit_length(): case for case in cases}.values():
+        _timed(solve, refine, case)
+    rows = [_timed(solve, refine, case) for case in cases]
     return Predictions(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
