@@ -47,12 +47,13 @@ class BinImage:
         capacity = 1 << max(len(poses) * len(self.truth) - 1, 0).bit_length()
         pairs = np.stack(np.broadcast_arrays(poses[:, None], self.truth[None]), axis=2).reshape(-1, 2, 4, 4)
         padded = np.concatenate([pairs, np.tile(np.eye(4), (capacity - len(pairs), 2, 1, 1))]).astype(np.float32)
-        found = np.asarray(_adi_of_pairs(padded, points))[: len(pairs)]
+        found = np.asarray(adi_of_pairs(padded, points))[: len(pairs)]
         return found.reshape(len(poses), len(self.truth)) / self.part.diameter
 
 
 @jax.jit
-def _adi_of_pairs(pairs: jax.Array, points: jax.Array) -> jax.Array:
+def adi_of_pairs(pairs: jax.Array, points: jax.Array) -> jax.Array:
+    """Return the ADI of pairs of poses (p, 2, 4, 4), the second one the true one, of an object's points (m, 3)."""
     return jax.lax.map(lambda pair: adi(pair[0], pair[1], points), pairs)
 
 

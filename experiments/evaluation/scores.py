@@ -6,14 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from experiments.bins import adi_of_pairs
 from experiments.evaluation.predictions import Export, Predictions, Truth
 from kmn_jax.data.cad import ObjectModel
-from kmn_jax.pose import adi
 
 THRESHOLD = 0.1  # of the object's size
 _POINTS = 1000  # of an object's surface, for errors
@@ -114,12 +113,7 @@ def _adi(pairs: Float[np.ndarray, "p 2 4 4"], model: ObjectModel) -> Float[np.nd
     near = pairs.copy()
     near[:, :, :3, 3] -= origin
     padded = np.concatenate([near, np.tile(np.eye(4), (capacity - len(pairs), 2, 1, 1))]).astype(np.float32)
-    return np.asarray(_adi_of_pairs(padded, jnp.asarray(model.points[:_POINTS], dtype=jnp.float32)))[: len(pairs)]
-
-
-@jax.jit
-def _adi_of_pairs(pairs: jax.Array, points: jax.Array) -> jax.Array:
-    return jax.lax.map(lambda pair: adi(pair[0], pair[1], points), pairs)
+    return np.asarray(adi_of_pairs(padded, jnp.asarray(model.points[:_POINTS], dtype=jnp.float32)))[: len(pairs)]
 
 
 def recall_rows(cells: Sequence[Cell], objects: str) -> list[dict[str, Any]]:
