@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.evaluation.rivals import Fpfh, fpfh_features, quiet_open3d, thinned_cloud
+from experiments.evaluation.rivals import Fpfh, described, quiet_open3d
 from kmn_jax.estimator.candidates import Solver
 from kmn_jax.estimator.part import Part
 from kmn_jax.estimator.scene import Scene
@@ -25,9 +25,8 @@ def fpfh_poses(part: Part, scene: Scene, crops: CropFeatures, key: PRNGKey) -> t
     open3d = quiet_open3d()
     registration = open3d.pipelines.registration
     open3d.utility.random.seed(int(jax.random.randint(key, (), 0, 2**31 - 1)))
-    features, gate = _FPFH.features, _FPFH.gate_voxels * _FPFH.features.voxel * part.diameter
-    model = thinned_cloud(part.points, part.normals, features, part.diameter)
-    model_features = fpfh_features(model, features, part.diameter)
+    gate = _FPFH.gate_voxels * _FPFH.features.voxel * part.diameter
+    model = described(part.points, part.normals, _FPFH.features, part.diameter)
     seeds, valid = np.asarray(crops.seed), np.asarray(crops.valid)
     count, size = np.asarray(crops.mask).shape
     poses = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1))
@@ -35,28 +34,12 @@ def fpfh_poses(part: Part, scene: Scene, crops: CropFeatures, key: PRNGKey) -> t
     share = np.zeros(count, dtype=np.float32)
     for row in np.flatnonzero(valid):
         near = ((scene.points - seeds[row]) ** 2).sum(axis=1) <= part.diameter**2
-        target = thinned_cloud(scene.points[near], None, features, part.diameter)
-        if len(target.points) < 10:
-            continue
-        coarse = registration.registration_ransac_based_on_feature_matching(
-            model,
-            target,
-            model_features,
-            fpfh_features(target, features, part.diameter),
-            True,
-            gate,
-            registration.TransformationEstimationPointToPoint(False),
-            3,
-            [
-                registration.CorrespondenceCheckerBasedOnEdgeLength(_FPFH.edge_similarity),
-                registration.CorrespondenceCheckerBasedOnDistance(gate),
-            ],
-            registration.RANSACConvergenceCriteria(_FPFH.iterations, _FPFH.confidence),
-        )
-        if not len(coarse.correspondence_set):
+        target = described(scene.points[near], None, _FPFH.features, part.diameter)
+        coarse = None if model is None or target is None else _FPFH.registered(model, target, part.diameter)
+        if model is None or target is None or coarse is None:
             continue
         fine = registration.registration_icp(
-            model, target, gate, coarse.transformation, registration.TransformationEstimationPointToPlane()
+            model.cloud, target.cloud, gate, coarse.transformation, registration.TransformationEstimationPointToPlane()
         )
         poses[row], found[row] = fine.transformation, True
         inliers[row], share[row] = len(coarse.correspondence_set), coarse.fitness

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,7 +39,7 @@ class Refinement:
         return pose
 
 
-@partial(jax.jit)
+@jax.jit
 def _refined(
     points: Float[Array, "m 3"], scene: SceneArrays, T_crop_object: Pose, diameter: Scalar, key: PRNGKey
 ) -> Pose:

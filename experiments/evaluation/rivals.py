@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +20,8 @@ from experiments.evaluation.methods import Solver
 from kmn_jax.data.cad import ObjectModel
 from kmn_jax.pose import Matches
 
+_LEAST_POINTS = 10  # of a thinned crop
+
 
 @dataclass(frozen=True)
 class FeatureSettings:
@@ -28,6 +30,13 @@ class FeatureSettings:
     voxel: float = 0.04
     normal_voxels: float = 2.0  # radius, at most 30 neighbours
     feature_voxels: float = 5.0  # radius, at most 100 neighbours
+
+
+class Described(NamedTuple):
+    """An Open3D cloud and the FPFH features of its points."""
+
+    cloud: Any
+    features: Any
 
 
 @dataclass(frozen=True)
@@ -48,36 +57,29 @@ class Fpfh:
 
     def prepare(self, model: ObjectModel) -> Solver:
         """Return a solver that describes each crop anew."""
-        open3d = quiet_open3d()
+        return _described_solver(
+            model, self.features, lambda source, target: self.registered(source, target, model.diameter)
+        )
+
+    def registered(self, source: Described, target: Described, diameter: float) -> Any:
+        """Return Open3D's result of moving a described cloud onto another one, None without any pair that agrees."""
+        import open3d
+
         registration = open3d.pipelines.registration
-        voxel = self.features.voxel * model.diameter
-        gate = self.gate_voxels * voxel
-        source = thinned_cloud(model.points, model.normals, self.features, model.diameter)
-        described = fpfh_features(source, self.features, model.diameter)
-
-        def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
-            open3d.utility.random.seed(case.random_seed % 2**31)
-            target = thinned_cloud(case.points, None, self.features, model.diameter)
-            if len(target.points) < 10:
-                return None
-            found = registration.registration_ransac_based_on_feature_matching(
-                source,
-                target,
-                described,
-                fpfh_features(target, self.features, model.diameter),
-                True,
-                gate,
-                registration.TransformationEstimationPointToPoint(False),
-                3,
-                [
-                    registration.CorrespondenceCheckerBasedOnEdgeLength(self.edge_similarity),
-                    registration.CorrespondenceCheckerBasedOnDistance(gate),
-                ],
-                registration.RANSACConvergenceCriteria(self.iterations, self.confidence),
-            )
-            return np.array(found.transformation) if len(found.correspondence_set) else None
-
-        return solve
+        gate = self.gate_voxels * self.features.voxel * diameter
+        found = registration.registration_ransac_based_on_feature_matching(
+            *(source.cloud, target.cloud, source.features, target.features),
+            True,
+            gate,
+            registration.TransformationEstimationPointToPoint(False),
+            3,
+            [
+                registration.CorrespondenceCheckerBasedOnEdgeLength(self.edge_similarity),
+                registration.CorrespondenceCheckerBasedOnDistance(gate),
+            ],
+            registration.RANSACConvergenceCriteria(self.iterations, self.confidence),
+        )
+        return found if len(found.correspondence_set) else None
 
 
 @dataclass(frozen=True)
@@ -95,24 +97,16 @@ class FastGlobal:
 
     def prepare(self, model: ObjectModel) -> Solver:
         """Return a solver that describes each crop anew."""
-        open3d = quiet_open3d()
-        registration = open3d.pipelines.registration
-        source = thinned_cloud(model.points, model.normals, self.features, model.diameter)
-        described = fpfh_features(source, self.features, model.diameter)
+        registration = quiet_open3d().pipelines.registration
         gate = self.gate_voxels * self.features.voxel * model.diameter
         option = registration.FastGlobalRegistrationOption(maximum_correspondence_distance=gate)
 
-        def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
-            open3d.utility.random.seed(case.random_seed % 2**31)
-            target = thinned_cloud(case.points, None, self.features, model.diameter)
-            if len(target.points) < 10:
-                return None
-            found = registration.registration_fgr_based_on_feature_matching(
-                source, target, described, fpfh_features(target, self.features, model.diameter), option
+        def registered(source: Described, target: Described) -> Any:
+            return registration.registration_fgr_based_on_feature_matching(
+                source.cloud, target.cloud, source.features, target.features, option
             )
-            return np.array(found.transformation)
 
-        return solve
+        return _described_solver(model, self.features, registered)
 
 
 @dataclass(frozen=True)
@@ -141,7 +135,7 @@ class PointPairs:
             # Relative to the seed: floats of millimetres far from the sensor would lose digits.
             offsets = np.asarray(target.points) - case.points[0]
             cloud = np.concatenate([offsets, np.asarray(target.normals)], axis=1).astype(np.float32)
-            if len(cloud) < 10:
+            if len(cloud) < _LEAST_POINTS:
                 return None
             found = detector.match(cloud, self.scene_share, self.sampling)
             if not len(found):
@@ -273,9 +267,34 @@ def thinned_cloud(
     return cloud
 
 
-def fpfh_features(cloud: Any, settings: FeatureSettings, diameter: float) -> Any:
+def described(
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"] | None,
+    settings: FeatureSettings,
+    diameter: float,
+) -> Described | None:
+    """Return a thinned cloud and its features, None if too few points are left."""
     import open3d
 
+    cloud = thinned_cloud(points, normals, settings, diameter)
+    if len(cloud.points) < _LEAST_POINTS:
+        return None
     radius = settings.feature_voxels * settings.voxel * diameter
-    search = open3d.geometry.KDTreeSearchParamHybrid(radius=radius, max_nn=100)
-    return open3d.pipelines.registration.compute_fpfh_feature(cloud, search)
+    near = open3d.geometry.KDTreeSearchParamHybrid(radius=radius, max_nn=100)
+    return Described(cloud, open3d.pipelines.registration.compute_fpfh_feature(cloud, near))
+
+
+def _described_solver(
+    model: ObjectModel, settings: FeatureSettings, registered: Callable[[Described, Described], Any]
+) -> Solver:
+    """Return a solver that describes a crop and registers the object, which is described once."""
+    open3d = quiet_open3d()
+    source = described(model.points, model.normals, settings, model.diameter)
+
+    def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
+        open3d.utility.random.seed(case.random_seed % 2**31)
+        target = described(case.points, None, settings, model.diameter)
+        found = None if source is None or target is None else registered(source, target)
+        return None if found is None else np.array(found.transformation)
+
+    return solve
