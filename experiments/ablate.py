@@ -9,25 +9,45 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from experiments.evaluate import Options, compare, released_or_own, run
 from experiments.evaluation.methods import Method, Ours, OursConfig
+from kmn_jax.estimator.crop_pose import CropPoseConfig
 from kmn_jax.models import Model
-from kmn_jax.pose import MatchConfig, RansacConfig
+
+_PLAIN = CropPoseConfig()
+
+
+def _pose(**changed: Any) -> OursConfig:
+    return OursConfig(replace(_PLAIN, **changed))
+
+
+def _matches(**changed: Any) -> OursConfig:
+    return _pose(matches=replace(_PLAIN.matches, **changed))
+
+
+def _ransac(**changed: Any) -> OursConfig:
+    return _pose(ransac=replace(_PLAIN.ransac, **changed))
+
 
 VARIANTS = {
     "10 keypoints": OursConfig(num_keypoints=10),
     "40 keypoints": OursConfig(num_keypoints=40),
-    "vote threshold 0.5": OursConfig(matches=MatchConfig(vote_threshold=0.5)),
-    "vote threshold 0.9": OursConfig(matches=MatchConfig(vote_threshold=0.9)),
-    "softmax over points": OursConfig(matches=MatchConfig(softmax="points")),
-    "no normal check": OursConfig(ransac=RansacConfig(use_normals=False)),
-    "100 hypotheses": OursConfig(ransac=RansacConfig(num_hypotheses=100)),
-    "4000 hypotheses": OursConfig(ransac=RansacConfig(num_hypotheses=4000)),
-    "gate 0.1": OursConfig(ransac=RansacConfig(distance_gate=0.1)),
+    "vote threshold 0.5": _matches(vote_threshold=0.5),
+    "vote threshold 0.9": _matches(vote_threshold=0.9),
+    "softmax over points": _matches(softmax="points"),
+    "no normal check": _ransac(use_normals=False),
+    "100 hypotheses": _ransac(num_hypotheses=100),
+    "2000 hypotheses": _ransac(num_hypotheses=2000),
+    "gate 0.1": _ransac(distance_gate=0.1),
     "256 points": OursConfig(num_points=256),
     "1024 points": OursConfig(num_points=1024),
-    "normals of 0.12 diameters": OursConfig(normal_radius=0.12),
+    "one draw": _pose(num_draws=1),
+    "two draws": _pose(num_draws=2),
+    "one pose a draw": _pose(num_modes=1),
+    "eight poses a draw": _pose(num_modes=8),
+    "no smoothing": _pose(smooth=None),
 }
 
 

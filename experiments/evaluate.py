@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -18,7 +18,7 @@ import tyro
 
 from experiments.evaluation.cases import ObjectImages, limited
 from experiments.evaluation.configs import CONFIGS, EvaluateConfig, find_config
-from experiments.evaluation.methods import Method, Ours, OursConfig
+from experiments.evaluation.methods import ONE_RANSAC, Method, Ours, OursConfig
 from experiments.evaluation.predictions import Export, code_digest, export
 from experiments.evaluation.refinement import SETTINGS
 from experiments.evaluation.report import Result, draw_pictures, write_report
@@ -77,7 +77,8 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
     export(objects, methods, config.noise, config.crops, config.seed, exported)
     titles = {key: method.name for key, method in methods.items()}
     cells = cells_of(exported, {found.name: found.model for found in objects}, titles, config.noise)
-    result = Result(config, environment(), exported.recipe, cells, skipped, tuple(problems))
+    used = {**exported.recipe, "methods": {key: exported.recipe["methods"][key] for key in methods}}
+    result = Result(config, environment(), used, cells, skipped, tuple(problems))
     own = methods.get("ours")
     pictures = draw_pictures(result, objects, exported, own if isinstance(own, Ours) else None)
     return write_report(folder, result, pictures)
@@ -91,13 +92,15 @@ def _methods(config: EvaluateConfig, model: Model) -> tuple[dict[str, Method], d
         reason = None
         if name == "ours":
             methods[name] = Ours("kmn_jax", model)
+        elif name == "ours_ransac":
+            methods[name] = Ours("kmn_jax, one RANSAC", model, OursConfig(ONE_RANSAC))
         elif name == "ours_no_normals":
-            unchecked = OursConfig(ransac=RansacConfig(use_normals=False))
-            methods[name] = Ours("kmn_jax without normal check", model, unchecked)
+            unchecked = replace(ONE_RANSAC, ransac=RansacConfig(use_normals=False))
+            methods[name] = Ours("kmn_jax, one RANSAC, no normal check", model, OursConfig(unchecked))
         elif name == "ours_open3d":
             reason = missing("open3d")
             if reason is None:
-                methods[name] = Ours("kmn_jax network, Open3D RANSAC", model, search=OverMatches())
+                methods[name] = Ours("kmn_jax, Open3D RANSAC", model, OursConfig(ONE_RANSAC), OverMatches())
         else:
             module, make = RIVALS[name]
             reason = missing(module)

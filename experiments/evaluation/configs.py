@@ -3,6 +3,9 @@
 electronics, industrial
     Command:   python -m experiments.build_data test-sets; python -m experiments.evaluate electronics
     Data:      7 held-out components and 7 parts of another class, 20 ray-cast bins of 1 to 20 copies each.
+validation
+    Command:   python -m experiments.build_data validation-bins; python -m experiments.tune_rivals validation
+    Data:      25 components of the training's class, for choices: ablate, tune_rivals.
 wrs
     Command:   python -m experiments.evaluate wrs --cad FOLDER_OF_WRS_MESHES
     Data:      the seven parts of the published out-of-class test, in bins made as those above.
@@ -29,7 +32,7 @@ import numpy as np
 from kmn_jax.checks import InputError
 
 Source = Literal["bop", "clouds"]
-METHODS = ("ours", "ours_no_normals", "ours_open3d", "fpfh", "fgr", "ppf", "kiss")
+METHODS = ("ours", "ours_ransac", "ours_no_normals", "ours_open3d", "fpfh", "fgr", "ppf", "kiss")
 
 
 @dataclass(frozen=True)
@@ -90,6 +93,7 @@ _WRS = ("04_37D", "05_PTPA30", "11_PTPA42", "07_SBARB", "08_SSFHRT", "13_APTF40"
 _ALL = (
     EvaluateConfig("electronics", folder=_SETS / "electronics"),
     EvaluateConfig("industrial", folder=_SETS / "industrial"),
+    EvaluateConfig("validation", folder=Path("outputs/validation_bins/perfect"), crops=10, seed=7),
     EvaluateConfig("wrs", folder=_SETS / "wrs", cad_names=_WRS),
     EvaluateConfig("clouds", source="clouds", noise=(0.0,)),
     EvaluateConfig("bop", noise=(0.0,)),

@@ -25,9 +25,14 @@ from kmn_jax.checks import InputError
 from kmn_jax.files import read_safetensors, write_whole
 
 _ROOT = Path(__file__).parents[2]
-_CODE = ("kmn_jax/geometry", "kmn_jax/models", "kmn_jax/pose", "kmn_jax/data/crops.py", "experiments/evaluation")
+_CODE = (
+    *("kmn_jax/geometry", "kmn_jax/models", "kmn_jax/pose", "experiments/evaluation"),
+    *(f"kmn_jax/data/{name}.py" for name in ("crops", "smoothing", "splat", "cad", "scene")),
+    *(f"kmn_jax/estimator/{name}.py" for name in ("crop_pose", "search", "part", "view")),
+)
 _NOT_POSES = ("scores.py", "report.py", "plots.py", "pictures.py", "published.py")  # of experiments/evaluation
 _HEADER = "kmn_jax evaluation 1"
+_OF_METHOD = "method "
 
 
 class Truth(NamedTuple):
@@ -66,15 +71,19 @@ class Export:
             old = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
         except (OSError, ValueError) as error:
             raise InputError(f"{file} cannot be read ({error}): choose another folder with --output") from None
-        if old is not None and old != plain and not overwrite:
-            differing = ", ".join(sorted(key for key in {*old, *plain} if old.get(key) != plain.get(key)))
-            raise InputError(
-                f"{folder} holds predictions of another recipe (differing: {differing}): give --overwrite to make them"
-                " anew, or another folder with --output"
-            )
-        if old != plain:
-            for stale in folder.rglob("*.safetensors"):
-                stale.unlink()
+        if old is not None:
+            stale = _differing(old, plain)
+            if stale and not overwrite:
+                raise InputError(
+                    f"{folder} holds predictions of another recipe (differing: {', '.join(stale)}): give --overwrite to"
+                    " make them anew, or another folder with --output"
+                )
+            for name in stale:
+                method = name.removeprefix(_OF_METHOD)
+                for made in (folder / _slug(method) if method != name else folder).rglob("*.safetensors"):
+                    made.unlink()
+            if not any(not name.startswith(_OF_METHOD) for name in stale):  # what other methods found stays
+                plain["methods"] = {**old.get("methods", {}), **plain.get("methods", {})}
         write_whole(file, (json.dumps(plain, indent=1) + "\n").encode())
         return cls(folder, plain)
 
@@ -91,11 +100,11 @@ class Export:
             "copy": np.array([case.copy for case in cases], dtype=np.int64),
             "visible": np.array([case.visible for case in cases], dtype=np.float64),
         }
-        self._write(self.path("cases", name, noise), tensors, {"names": json.dumps([case.name for case in cases])})
+        self._write("cases", name, noise, tensors, {"names": json.dumps([case.name for case in cases])})
 
     def truth(self, name: str, noise: float) -> Truth:
         """Read the true poses of cases. Raises InputError if they are not there."""
-        tensors, metadata = self._read(self.path("cases", name, noise))
+        tensors, metadata = self._read("cases", name, noise)
         ends = np.cumsum(tensors["counts"])[:-1]
         return Truth(
             tuple(json.loads(metadata["names"])),
@@ -106,26 +115,38 @@ class Export:
 
     def write(self, method: str, name: str, noise: float, found: Predictions) -> None:
         """Write what a method found."""
-        self._write(self.path(method, name, noise), found._asdict(), {})
+        self._write(method, name, noise, found._asdict(), {})
 
     def read(self, method: str, name: str, noise: float) -> Predictions:
         """Read what a method found. Raises InputError if it is not there."""
-        return Predictions(**self._read(self.path(method, name, noise))[0])
+        return Predictions(**self._read(method, name, noise)[0])
 
-    def _write(self, path: Path, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
+    def _write(
+        self, method: str, name: str, noise: float, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]
+    ) -> None:
+        path = self.path(method, name, noise)
         path.parent.mkdir(parents=True, exist_ok=True)
         plain = {key: np.ascontiguousarray(value) for key, value in tensors.items()}
-        write_whole(path, save(plain, metadata={"format": _HEADER, "recipe": self._digest, **metadata}))
+        write_whole(path, save(plain, metadata={"format": _HEADER, "recipe": self._digest(method), **metadata}))
 
-    def _read(self, path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    def _read(self, method: str, name: str, noise: float) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+        path = self.path(method, name, noise)
         tensors, metadata = read_safetensors(path)
-        if metadata.get("format") != _HEADER or metadata.get("recipe") != self._digest:
+        if metadata.get("format") != _HEADER or metadata.get("recipe") != self._digest(method):
             raise InputError(f"{path} was made by another recipe: delete it, and evaluate again")
         return tensors, metadata
 
-    @property
-    def _digest(self) -> str:
-        return hashlib.sha256(json.dumps(self.recipe, sort_keys=True).encode()).hexdigest()
+    def _digest(self, method: str) -> str:
+        """Return the SHA-256 of all that a method's poses depend on: not the other methods."""
+        own = {**self.recipe, "methods": self.recipe.get("methods", {}).get(method)}
+        return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()
+
+
+def _differing(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """Return what differs between recipes, methods one by one; what only one of them has of these is no difference."""
+    shared = [key for key in sorted({*old, *new} - {"methods"}) if old.get(key) != new.get(key)]
+    before, now = old.get("methods", {}), new.get("methods", {})
+    return shared + [f"{_OF_METHOD}{key}" for key in sorted({*before} & {*now}) if before[key] != now[key]]
 
 
 def export(

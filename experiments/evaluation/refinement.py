@@ -8,16 +8,19 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from experiments.evaluation.cases import Case
-from experiments.evaluation.methods import drawn_crop, padded
+from experiments.evaluation.methods import padded
 from kmn_jax.data.cad import ObjectModel
+from kmn_jax.data.smoothing import SmoothConfig
+from kmn_jax.estimator.crop_pose import drawn_crop
 from kmn_jax.estimator.search import SceneArrays
 from kmn_jax.pose import IcpConfig, icp
 from kmn_jax.typing import Pose, PRNGKey, Scalar
 
 CONFIG = IcpConfig(iterations=20)
 _OBJECT_POINTS, _SCENE_POINTS = 2048, 512
-_NORMAL_RADIUS, _NORMAL_POINTS = 0.06, 4096
-SETTINGS = {"icp": CONFIG, "object points": _OBJECT_POINTS, "scene points": _SCENE_POINTS}
+_NORMAL_POINTS = 4096
+_SMOOTH = SmoothConfig()
+SETTINGS = {"icp": CONFIG, "object points": _OBJECT_POINTS, "scene points": _SCENE_POINTS, "smooth": _SMOOTH}
 
 
 class Refinement:
@@ -43,7 +46,7 @@ class Refinement:
 def _refined(
     points: Float[Array, "m 3"], scene: SceneArrays, T_crop_object: Pose, diameter: Scalar, key: PRNGKey
 ) -> Pose:
-    crop = drawn_crop(scene, diameter, key, _SCENE_POINTS, _NORMAL_RADIUS, _NORMAL_POINTS)
+    crop = drawn_crop(scene, diameter, key, _SCENE_POINTS, _NORMAL_POINTS, _SMOOTH)
     fine = icp(
         points,
         crop.points,

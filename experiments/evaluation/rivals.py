@@ -12,15 +12,19 @@ from dataclasses import asdict, dataclass
 from importlib import import_module
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from experiments.evaluation.cases import Case
 from experiments.evaluation.methods import Solver
 from kmn_jax.data.cad import ObjectModel
+from kmn_jax.data.smoothing import smoothed
+from kmn_jax.estimator.view import padded_points
 from kmn_jax.pose import Matches
 
 _LEAST_POINTS = 10  # of a thinned crop
+_SMOOTHED_BY = 4096  # points of a crop
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,7 @@ class FeatureSettings:
     voxel: float = 0.04
     normal_voxels: float = 2.0  # radius, at most 30 neighbours
     feature_voxels: float = 5.0  # radius, at most 100 neighbours
+    smooth: bool = False  # points and normals of a scan as our network gets them, see `kmn_jax.data.smoothing`
 
 
 class Described(NamedTuple):
@@ -153,6 +158,7 @@ class Kiss:
 
     name: str = "KISS-Matcher"
     voxel: float = 0.025
+    features: FeatureSettings | None = None  # to smooth the crop first, if given
 
     @property
     def settings(self) -> Mapping[str, Any]:
@@ -169,7 +175,10 @@ class Kiss:
 
         def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
             matcher = kiss_matcher.KISSMatcher(settings)
-            target = ((case.points - case.points[0]) / model.diameter).astype(np.float32)
+            points = case.points.astype(np.float64)
+            if self.features is not None:
+                points = np.asarray(thinned_cloud(points, None, self.features, model.diameter).points)
+            target = ((points - case.points[0]) / model.diameter).astype(np.float32)
             found = matcher.estimate(source, target)
             pose = np.eye(4)
             pose[:3, :3] = np.array(found.rotation)
@@ -261,10 +270,32 @@ def thinned_cloud(
     if normals is not None:
         cloud.normals = _vectors(normals)
         return cloud.voxel_down_sample(voxel)
-    cloud = cloud.voxel_down_sample(voxel)
+    thinned = cloud.voxel_down_sample(voxel)
+    if settings.smooth:
+        return _smoothed(np.asarray(thinned.points), points, diameter)
+    cloud = thinned
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamHybrid(radius=settings.normal_voxels * voxel, max_nn=30))
     cloud.orient_normals_towards_camera_location(np.zeros(3))
     return cloud
+
+
+def _smoothed(thinned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "p 3"], diameter: float) -> Any:
+    """Return a thinned cloud on the planes through all points of the scan around it, with their normals."""
+    import open3d
+
+    origin = points[0].astype(np.float64)
+    rows = np.random.default_rng(0).choice(len(points), min(_SMOOTHED_BY, len(points)), replace=False)
+    few, mask = padded_points((thinned - origin).astype(np.float32), 1024)
+    many, there = padded_points((points[rows] - origin).astype(np.float32), _SMOOTHED_BY)
+    moved, normals, known, _ = jax.device_get(_smooth(few, mask, many, there, np.float32(diameter)))
+    real = np.asarray(mask) & known
+    cloud = open3d.geometry.PointCloud(_vectors(moved[real] + origin))
+    cloud.normals = _vectors(normals[real])
+    cloud.orient_normals_towards_camera_location(np.zeros(3))
+    return cloud
+
+
+_smooth = jax.jit(smoothed)
 
 
 def described(

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from kmn_jax.data.smoothing import SmoothConfig, smoothed
 from kmn_jax.data.splat import BIN, VisiblePoints
 from kmn_jax.geometry import nearest, orient_to_camera, transform_points
 from kmn_jax.geometry.ball_normals import normals_within_radius
@@ -35,6 +36,7 @@ class CropConfig:
     normals: NormalSource = "estimated"
     normal_radius: float = 0.06
     normal_points: int = 4096
+    smooth: SmoothConfig | None = None  # of estimated normals: the radius is then its own, and points are moved
     include_bin: bool = True
     min_points: int = 16  # a crop of fewer is not valid
     min_visible_fraction: float = 0.1  # of the seed's copy, see VisiblePoints
@@ -135,6 +137,9 @@ def crop_around(
     rows, exact, points = rows[kept], exact[kept], noisy[kept]
     if config.normals == "surface":
         normals, known = visible.normals[rows], mask
+    elif config.smooth is not None:
+        points, normals, known, _ = smoothed(points, mask, noisy, drawn, diameter, config.smooth)
+        seed, points = seed + points[0], jnp.where(mask[:, None], points - points[:1], 0)
     else:
         normals, known = normals_within_radius(points, noisy, config.normal_radius * diameter, drawn)
     normals = jnp.where(known[:, None], orient_to_camera(points, normals, -seed), _unit(-seed[None] - points))

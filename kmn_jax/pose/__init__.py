@@ -20,6 +20,7 @@ from kmn_jax.pose.metrics import (
 )
 from kmn_jax.pose.ransac import RansacConfig, ransac, ransac_modes
 from kmn_jax.pose.result import PoseResult, PoseStatus
+from kmn_jax.pose.surface import SurfaceAgreement, SurfaceConfig, surface_agreement
 
 __all__ = [
     "IcpConfig",
@@ -28,6 +29,8 @@ __all__ = [
     "PoseResult",
     "PoseStatus",
     "RansacConfig",
+    "SurfaceAgreement",
+    "SurfaceConfig",
     "add",
     "adi",
     "bounding_box_diagonal",
@@ -42,4 +45,5 @@ __all__ = [
     "ransac",
     "ransac_modes",
     "recall",
+    "surface_agreement",
 ]

@@ -194,13 +194,14 @@ def _ransac(key: PRNGKey, matches: Matches, config: RansacConfig, num_modes: int
         return jnp.where(rotation_is_determined(object_points, inlier_weights), refined, pose), None
 
     gates = jnp.array(config.refinement_gates, dtype=jnp.float32)
-    score = jnp.where(is_candidate, counts, -1)
-    modes, there = [], []
-    for _ in range(num_modes):
+
+    def next_mode(score: Int[Array, " h"], _: None) -> tuple[Int[Array, " h"], tuple[Pose, Bool[Array, ""]]]:
         row = jnp.argmax(score)
-        modes.append(jax.lax.scan(refine, poses[row], gates)[0])
-        there.append(score[row] >= 0)
-        score = jnp.where(_differ(poses, modes[-1], config), score, -1)
+        mode, _ = jax.lax.scan(refine, poses[row], gates)
+        return jnp.where(_differ(poses, mode, config), score, -1), (mode, score[row] >= 0)
+
+    start = jnp.where(is_candidate, counts, -1)
+    _, (modes, there) = jax.lax.scan(next_mode, start, length=num_modes)
 
     def finish(best: Pose, is_there: Bool[Array, ""]) -> PoseResult:
         inlier_mask, squares = inliers(best, config.distance_gate)
@@ -233,7 +234,7 @@ def _ransac(key: PRNGKey, matches: Matches, config: RansacConfig, num_modes: int
             status=status,
         )
 
-    return jax.vmap(finish)(jnp.stack(modes), jnp.stack(there))
+    return jax.vmap(finish)(modes, there)
 
 
 def _differ(poses: Float[Array, "h 4 4"], pose: Pose, config: RansacConfig) -> Bool[Array, " h"]:

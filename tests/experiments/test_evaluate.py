@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import ablate, evaluate
+from experiments import ablate, evaluate, tune_rivals
 from experiments.evaluation.cases import Case, ObjectImages, draw_cases
 from experiments.evaluation.configs import EvaluateConfig
 from experiments.evaluation.rivals import RIVALS, FastGlobal, Fpfh, Kiss, PointPairs, missing
@@ -181,6 +181,16 @@ def test_an_ablation_changes_one_choice_at_a_time(tmp_path: Path, monkeypatch: p
     settings = content["recipe"]["methods"]
     assert settings["10_keypoints"]["num_keypoints"] == 10
     assert settings["ours"]["num_keypoints"] is None
+
+
+def test_rivals_are_tuned_by_settings_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tune_rivals, "_VOXELS", {"fpfh": (0.05,), "kiss": (0.03,)})
+    options = ["demo", "--objects", GEAR, "--images", "1", "--crops", "2", "--output", str(tmp_path / "out")]
+    assert tune_rivals.main(options) == 0
+    settings = json.loads((tmp_path / "out" / "scores.json").read_text())["recipe"]["methods"]
+    assert set(settings) == {f"{name}{how}" for name in ("fpfh_0.05", "kiss_0.03") for how in ("", "_smoothed")}
+    assert settings["fpfh_0.05_smoothed"]["features"]["smooth"]
+    assert settings["fpfh_0.05"]["features"]["voxel"] == 0.05
 
 
 @pytest.mark.parametrize(

@@ -104,6 +104,24 @@ def test_tables_and_where_others_find_more() -> None:
     assert "within" in lines[1]
 
 
+def test_a_method_can_be_added_and_one_of_other_settings_is_refused(tmp_path: Path, model: ObjectModel) -> None:
+    folder, none = tmp_path / "methods", np.zeros((0, 4, 4))
+    nothing = Predictions(none, none, np.zeros(0, dtype=bool), np.zeros(0), np.zeros(0))
+
+    def opened(methods: dict[str, int], overwrite: bool = False) -> Export:
+        return Export.open(folder, {"config": 1, "methods": methods}, overwrite)
+
+    opened({"a": 1}).write("a", "box", NOISE, nothing)
+    opened({"b": 1}).write("b", "box", NOISE, nothing)
+    with pytest.raises(InputError, match=r"differing: method a\)"):
+        opened({"a": 2})
+    kept = opened({"a": 1, "b": 1})
+    assert len(kept.read("a", "box", NOISE).found) == len(kept.read("b", "box", NOISE).found) == 0
+    changed = opened({"a": 2}, overwrite=True)
+    assert not changed.path("a", "box", NOISE).exists()
+    assert len(changed.read("b", "box", NOISE).found) == 0
+
+
 def test_what_another_recipe_made_is_refused(tmp_path: Path, exported: Export, model: ObjectModel) -> None:
     Export.open(tmp_path / "out", {"config": 1}, overwrite=False)
     with pytest.raises(InputError, match="differing: config"):

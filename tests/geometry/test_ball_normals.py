@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kmn_jax.checks import InputError
-from kmn_jax.geometry.ball_normals import normals_within_radius
+from kmn_jax.geometry.ball_normals import normals_within_radius, planes_within_radius
 
 estimate = jax.jit(normals_within_radius)
 
@@ -109,3 +109,14 @@ def test_vmap_equals_a_loop() -> None:
         cosine = np.abs((np.asarray(batched[0][i]) * np.asarray(normals)).sum(axis=1))
         assert cosine.min() > 1 - 1e-5
         np.testing.assert_array_equal(batched[1][i], valid)
+
+
+def test_heights_and_residuals_are_those_of_the_points_about_the_plane() -> None:
+    points = shell(3).astype(np.float64) + np.array([3.0, -2, 5])
+    queries = points[:40] + np.random.default_rng(1).normal(0, 0.05, (40, 3))
+    found = jax.jit(planes_within_radius)(queries.astype(np.float32), points.astype(np.float32), 0.4)
+    assert np.asarray(found.valid).all()
+    for query, normal, height, residual in zip(queries, *(np.asarray(field) for field in found[:3]), strict=True):
+        near = points[np.linalg.norm(points - query, axis=1) <= 0.4]
+        assert height == pytest.approx((query - near.mean(axis=0)) @ normal, abs=5e-3)
+        assert residual == pytest.approx(((near - near.mean(axis=0)) @ normal).std(), abs=3e-3)

@@ -1,0 +1,180 @@
+"""The pose of the copy in the middle of one crop, from points to pose in one compiled call.
+
+The network sees several draws of the crop's points, as another draw often succeeds where one fails. Of all poses that
+their matches agree on, the one that the measured surface confirms best is chosen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from kmn_jax.data.crops import Crop, CropConfig, crop_around
+from kmn_jax.data.smoothing import SmoothConfig
+from kmn_jax.estimator.search import PartArrays, SceneArrays, as_visible
+from kmn_jax.models import KeyMatchNet
+from kmn_jax.pose import (
+    MatchConfig,
+    Matches,
+    PoseResult,
+    RansacConfig,
+    SurfaceConfig,
+    find_matches,
+    ransac_modes,
+    surface_agreement,
+)
+from kmn_jax.typing import PRNGKey, Scalar
+
+
+@dataclass(frozen=True)
+class CropPoseConfig:
+    """How a pose is found in a crop; lengths are shares of the object's diameter."""
+
+    num_draws: int = 4  # of points that the network sees
+    num_modes: int = 4  # poses of each draw that are compared with the surface
+    matches: MatchConfig = field(default_factory=lambda: MatchConfig(capacity=1024))
+    ransac: RansacConfig = field(default_factory=lambda: RansacConfig(num_hypotheses=500, num_candidates=8192))
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    surface_points: int = 128  # on the object
+    smooth: SmoothConfig | None = field(default_factory=SmoothConfig)
+    normal_points: int = 4096  # of the crop, from which normals are estimated
+
+    def __post_init__(self) -> None:
+        """Refuse values that contradict their meaning."""
+        if min(self.num_draws, self.num_modes, self.surface_points) < 1:
+            raise ValueError(
+                f"num_draws = {self.num_draws}, num_modes = {self.num_modes} and surface_points ="
+                f" {self.surface_points} must be 1 or more"
+            )
+
+
+class Said(NamedTuple):
+    """What the network says of the n points of a draw; with a leading axis, of several draws."""
+
+    points: Float[Array, "*d n 3"]  # relative to the crop's seed
+    normals: Float[Array, "*d n 3"]
+    mask: Bool[Array, "*d n"]
+    segmentation: Float[Array, "*d n 2"]
+    logits: Float[Array, "*d n k"]
+
+    @property
+    def on_object(self) -> Bool[Array, "*d n"]:
+        """Which points are taken for the seed's copy."""
+        return self.mask & (self.segmentation[..., 1] > self.segmentation[..., 0])
+
+
+def drawn_crop(
+    scene: SceneArrays,
+    diameter: Scalar,
+    key: PRNGKey,
+    num_points: int,
+    normal_points: int,
+    smooth: SmoothConfig | None,
+) -> Crop:
+    """Return some of the points within a diameter of a scene's first point, with their normals, relative to it."""
+    crops = CropConfig(
+        num_points=num_points,
+        max_noise=0.0,
+        normal_points=normal_points,
+        min_points=min(16, num_points),
+        smooth=smooth,
+    )
+    nowhere = jnp.zeros((1, 3)), jnp.eye(4)[None]
+    return crop_around(key, as_visible(scene), jnp.int32(0), jnp.bool_(True), *nowhere, diameter, crops)
+
+
+def said_of_draws(
+    network: KeyMatchNet,
+    part: PartArrays,
+    scene: SceneArrays,
+    key: PRNGKey,
+    num_points: int,
+    config: CropPoseConfig,
+) -> tuple[Crop, Said]:
+    """Return a crop around a scene's first point, and what the network says of draws of it; fields of it (d, ...)."""
+    count = config.num_draws
+    crop = drawn_crop(scene, part.diameter, key, count * (num_points - 1) + 1, config.normal_points, config.smooth)
+
+    def one(draw: Int[Array, ""]) -> Said:
+        # Each has the seed, and every so many-th of the others: also where there are fewer than asked for.
+        rows = jnp.concatenate([jnp.zeros(1, jnp.int32), 1 + draw + count * jnp.arange(num_points - 1)])
+        points, normals, mask = crop.points[rows], crop.normals[rows], crop.mask[rows]
+        features = network.encode_scene(jnp.concatenate([points, normals], axis=1), part.diameter, mask)
+        return Said(points, normals, mask, *network.match(features, part.features, mask))
+
+    return crop, jax.lax.map(one, jnp.arange(count, dtype=jnp.int32))
+
+
+def matches_of(said: Said, part: PartArrays, config: MatchConfig) -> Matches:
+    """Return the matches of a draw, relative to the crop's seed."""
+    count = part.features.shape[0]
+    return find_matches(
+        said.segmentation,
+        said.logits,
+        said.points,
+        said.normals,
+        part.points[:count],
+        part.normals[:count],
+        part.diameter,
+        said.mask,
+        config,
+    )
+
+
+@partial(jax.jit, static_argnames=("graphdef", "config", "num_points"))
+def crop_pose(
+    graphdef: nnx.GraphDef,
+    parameters: nnx.State,
+    part: PartArrays,
+    scene: SceneArrays,
+    key: PRNGKey,
+    num_points: int,
+    config: CropPoseConfig = CropPoseConfig(),
+) -> PoseResult:
+    """Return the pose of the copy that shows a scene's first point, in the scene's frame: the camera is its origin.
+
+    What is farther from that point than a diameter is not used. `num_points` of a draw are as many as the network was
+    made for. Inlier counts are those of the matches of the draw that the pose is from, its mask that draw's.
+    """
+    crop_key, pose_key = jax.random.split(key)
+    crop, said = said_of_draws(nnx.merge(graphdef, parameters), part, scene, crop_key, num_points, config)
+    surface, normals = part.points[: config.surface_points], part.normals[: config.surface_points]
+
+    def poses_of(item: tuple[Said, Key[Array, ""]]) -> PoseResult:
+        draw, key = item
+        return ransac_modes(key, matches_of(draw, part, config.matches), config.num_modes, config.ransac)
+
+    keys = jax.random.split(pose_key, config.num_draws)
+    poses, points, point_normals, mask, on_object = jax.tree.map(
+        lambda leaf: leaf.reshape(-1, *leaf.shape[2:]),
+        (jax.lax.map(poses_of, (said, keys)), said.points, said.normals, said.mask, said.on_object),
+    )
+
+    def score_of(pose: PoseResult) -> Scalar:
+        def compared() -> Scalar:
+            seen = surface_agreement(
+                pose.T_scene_object,
+                surface,
+                normals,
+                points,
+                point_normals,
+                mask,
+                on_object,
+                -crop.seed,
+                part.diameter,
+                config.surface,
+            )
+            return seen.score + pose.score
+
+        return jax.lax.cond(pose.converged, compared, lambda: jnp.float32(-jnp.inf))
+
+    best = jnp.argmax(jax.lax.map(score_of, poses))
+    found: PoseResult = jax.tree.map(lambda leaf: leaf[best], poses)
+    pose = jnp.where(found.converged, found.T_scene_object.at[:3, 3].add(crop.seed), found.T_scene_object)
+    return found._replace(T_scene_object=pose)
