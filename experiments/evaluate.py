@@ -22,9 +22,10 @@ from experiments.evaluation.methods import ONE_RANSAC, Method, Ours, OursConfig
 from experiments.evaluation.predictions import Export, code_digest, export
 from experiments.evaluation.refinement import SETTINGS
 from experiments.evaluation.report import Result, draw_pictures, write_report
-from experiments.evaluation.rivals import RIVALS, OverMatches, missing
+from experiments.evaluation.rivals import OverMatches, missing
 from experiments.evaluation.scores import cells_of
 from experiments.evaluation.sources import bop_objects, cloud_objects
+from experiments.evaluation.tuned import RIVALS
 from experiments.test_sets import build_test_set
 from kmn_jax.checks import InputError
 from kmn_jax.data.bop import dataset_digest

@@ -12,7 +12,8 @@ from typing import Any
 
 from experiments.evaluate import Options, compare, released_or_own, run
 from experiments.evaluation.methods import Method
-from experiments.evaluation.rivals import RIVALS, FastGlobal, FeatureSettings, Fpfh, Kiss, PointPairs, missing
+from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kiss, PointPairs, missing
+from experiments.evaluation.tuned import RIVALS
 
 _VOXELS = {"fpfh": (0.03, 0.04, 0.05), "fgr": (0.025, 0.03, 0.04, 0.05), "kiss": (0.015, 0.02, 0.025, 0.035)}
 _SCENE_SHARES = (0.2, 0.1, 0.05, 0.025)  # of PPF

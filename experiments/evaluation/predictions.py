@@ -30,7 +30,8 @@ _CODE = (
     *(f"kmn_jax/data/{name}.py" for name in ("crops", "smoothing", "splat", "cad", "scene")),
     *(f"kmn_jax/estimator/{name}.py" for name in ("crop_pose", "search", "part", "view")),
 )
-_NOT_POSES = ("scores.py", "report.py", "plots.py", "pictures.py", "published.py")  # of experiments/evaluation
+# Of experiments/evaluation; what configs and tuned settings say is in the recipe.
+_NOT_POSES = ("scores.py", "report.py", "plots.py", "pictures.py", "published.py", "configs.py", "tuned.py")
 _HEADER = "kmn_jax evaluation 1"
 _OF_METHOD = "method "
 

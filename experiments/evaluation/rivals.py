@@ -3,6 +3,7 @@
 All rivals get the same crops as we do, thinned to voxels, and the same refinement. Where an author recommends settings
 they are taken, scaled by the object's size; the published baseline's (arXiv 2303.16102: FPFH of 10 mm, gate of 5 mm,
 100,000 iterations, for parts of about 8 cm) are of that scale, too.
+Those that were chosen on validation bins are in `tuned`.
 """
 
 from __future__ import annotations
@@ -240,14 +241,6 @@ def missing(module: str) -> str | None:
     except Exception as error:  # an extension module may fail in any way
         return f"{module} cannot be imported ({str(error).splitlines()[0] if str(error) else type(error).__name__})"
     return None
-
-
-RIVALS: Mapping[str, tuple[str, Callable[[], Any]]] = {
-    "fpfh": ("open3d", Fpfh),
-    "fgr": ("open3d", FastGlobal),
-    "ppf": ("cv2.ppf_match_3d", PointPairs),
-    "kiss": ("kiss_matcher", Kiss),
-}
 
 
 def _vectors(points: Float[np.ndarray, "n 3"]) -> Any:

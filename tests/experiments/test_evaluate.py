@@ -12,8 +12,9 @@ import pytest
 from experiments import ablate, evaluate, tune_rivals
 from experiments.evaluation.cases import Case, ObjectImages, draw_cases
 from experiments.evaluation.configs import EvaluateConfig
-from experiments.evaluation.rivals import RIVALS, FastGlobal, Fpfh, Kiss, PointPairs, missing
+from experiments.evaluation.rivals import FastGlobal, Fpfh, Kiss, PointPairs, missing
 from experiments.evaluation.sources import bop_objects, cloud_objects
+from experiments.evaluation.tuned import RIVALS
 from kmn_jax.checks import InputError
 from kmn_jax.pose import adi
 from tests.data.bop_sample import save_image

@@ -1,0 +1,19 @@
+"""The rivals as they are compared: what found most poses after ICP on validation bins, see `experiments.tune_rivals`.
+
+Apart from `rivals`, so that a setting that changes makes the poses of its own method stale and no others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kiss, PointPairs
+
+# By the names of the methods: the package that is needed, and what makes the rival.
+RIVALS: Mapping[str, tuple[str, Callable[[], Any]]] = {
+    "fpfh": ("open3d", lambda: Fpfh(features=FeatureSettings(voxel=0.05))),
+    "fgr": ("open3d", lambda: FastGlobal(features=FeatureSettings(voxel=0.025))),
+    "ppf": ("cv2.ppf_match_3d", PointPairs),
+    "kiss": ("kiss_matcher", Kiss),
+}
