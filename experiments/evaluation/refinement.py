@@ -17,7 +17,7 @@ from kmn_jax.pose import IcpConfig, icp
 from kmn_jax.typing import Pose, PRNGKey, Scalar
 
 CONFIG = IcpConfig(iterations=20)
-_OBJECT_POINTS, _SCENE_POINTS = 2048, 512
+_OBJECT_POINTS, _SCENE_POINTS = 1024, 512
 _NORMAL_POINTS = 4096
 _SMOOTH = SmoothConfig()
 SETTINGS = {"icp": CONFIG, "object points": _OBJECT_POINTS, "scene points": _SCENE_POINTS, "smooth": _SMOOTH}

@@ -15,5 +15,5 @@ RIVALS: Mapping[str, tuple[str, Callable[[], Any]]] = {
     "fpfh": ("open3d", lambda: Fpfh(features=FeatureSettings(voxel=0.05))),
     "fgr": ("open3d", lambda: FastGlobal(features=FeatureSettings(voxel=0.025))),
     "ppf": ("cv2.ppf_match_3d", PointPairs),
-    "kiss": ("kiss_matcher", Kiss),
+    "kiss": ("kiss_matcher", lambda: Kiss(voxel=0.015, features=FeatureSettings(voxel=0.01, smooth=True))),
 }
