@@ -7,11 +7,14 @@ import difflib
 from configs.base import base
 from configs.debug import debug
 from configs.paper import paper, paper_tenth
+from configs.per_object import per_object
 from configs.small import small
 from kmn_jax.checks import InputError
 from kmn_jax.train.config import TrainConfig
 
-CONFIGS: dict[str, TrainConfig] = {config.name: config for config in (paper, paper_tenth, base, small, debug)}
+CONFIGS: dict[str, TrainConfig] = {
+    config.name: config for config in (paper, paper_tenth, base, small, per_object, debug)
+}
 
 
 def find_config(name: str) -> TrainConfig:

@@ -8,6 +8,7 @@ test-sets    7 electronic and 7 industrial objects in 20 bins each, rendered by 
              digests are compared with those in `assets/test_sets.json`.
 validation-bins  the 50 validation components in 6 bins each, rendered by ray casting, one half as a perfect sensor sees
              them, the other as a structured-light scanner: what the probabilities of detections are fitted on.
+per-object   the pack of one part, for a network of its own: 160 training and 160 validation scenes.
 check        what a pack holds: every file against its checksum, every copy against the walls of its bin.
 small        the few objects and images that the repository carries: `assets/small_pack`, `assets/small_test_set`.
 
@@ -39,7 +40,7 @@ from experiments.test_sets import (
     verdict,
 )
 from kmn_jax.checks import InputError
-from kmn_jax.data.build import Record, build_pack
+from kmn_jax.data.build import Record, Source, build_pack
 from kmn_jax.data.pack import Pack, PackedObject
 from kmn_jax.data.recipe import PackConfig
 from kmn_jax.data.scene import BinScene
@@ -124,6 +125,21 @@ class ValidationBins:
         sensors = {"perfect": PERFECT, "structured_light": SensorConfig.structured_light()}
         for row, (name, sensor) in enumerate(sensors.items()):
             build_test_set(self.folder / name, sources[row::2], VALIDATION_CONFIG, sensor, self.workers)
+
+
+@dataclass(frozen=True)
+class PerObject:
+    """Build the pack of one part, for a network of its own: training and validation scenes are different ones."""
+
+    cad: Path
+    folder: Path = OUTPUTS / "packs" / "per_object"
+    workers: int | None = None
+    pack: PackConfig = field(default_factory=lambda: PackConfig(drops=160))
+
+    def run(self) -> None:
+        name = self.cad.stem
+        sources = [Source(name, "train", self.cad), Source(f"{name}.validation", "validation", self.cad, scenes=1)]
+        print_summary(self.folder, build_pack(self.folder, sources, self.pack, workers=self.workers))
 
 
 @dataclass(frozen=True)
@@ -224,6 +240,7 @@ def main() -> None:
                 "electronics": Electronics,
                 "test-sets": TestSets,
                 "validation-bins": ValidationBins,
+                "per-object": PerObject,
                 "check": Check,
                 "small": Small,
             }

@@ -17,8 +17,8 @@ from typing import Annotated
 import tyro
 
 from experiments.evaluation.cases import ObjectImages, limited
-from experiments.evaluation.configs import CONFIGS, EvaluateConfig, find_config
-from experiments.evaluation.methods import ONE_RANSAC, Method, Ours, OursConfig
+from experiments.evaluation.configs import CONFIGS, OWN_NETWORKS, EvaluateConfig, find_config
+from experiments.evaluation.methods import ONE_RANSAC, Method, Ours, OursConfig, OwnNetworks
 from experiments.evaluation.predictions import Export, code_digest, export
 from experiments.evaluation.refinement import SETTINGS
 from experiments.evaluation.report import Result, draw_pictures, write_report
@@ -43,13 +43,14 @@ class Options:
 
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")]
     output: Path | None = None  # folder; outputs/evaluation/NAME unless given
+    networks: Path | None = None  # of the method per_object: a folder with OBJECT.safetensors for each object
     overwrite: bool = False  # delete predictions of another recipe that are there
 
 
 def evaluate(options: Options) -> Path:
     """Evaluate and return the path of the report's page."""
     model = released_or_own(options.config.weights)
-    methods, skipped = _methods(options.config, model)
+    methods, skipped = _methods(options.config, model, options.networks)
     return compare(options, model, methods, skipped)
 
 
@@ -85,7 +86,7 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
     return write_report(folder, result, pictures)
 
 
-def _methods(config: EvaluateConfig, model: Model) -> tuple[dict[str, Method], dict[str, str]]:
+def _methods(config: EvaluateConfig, model: Model, networks: Path | None) -> tuple[dict[str, Method], dict[str, str]]:
     """Return the methods that can run, and why others cannot."""
     methods: dict[str, Method] = {}
     skipped: dict[str, str] = {}
@@ -98,6 +99,8 @@ def _methods(config: EvaluateConfig, model: Model) -> tuple[dict[str, Method], d
         elif name == "ours_no_normals":
             unchecked = replace(ONE_RANSAC, ransac=RansacConfig(use_normals=False))
             methods[name] = Ours("kmn_jax, one RANSAC, no normal check", model, OursConfig(unchecked))
+        elif name == OWN_NETWORKS:
+            methods[name] = OwnNetworks("kmn_jax, trained for the object", _own_networks(networks))
         elif name == "ours_open3d":
             reason = missing("open3d")
             if reason is None:
@@ -113,6 +116,16 @@ def _methods(config: EvaluateConfig, model: Model) -> tuple[dict[str, Method], d
     if not methods:
         raise InputError(f"none of the methods can run: {'; '.join(skipped.values())}")
     return methods, skipped
+
+
+def _own_networks(folder: Path | None) -> dict[str, Model]:
+    """Load networks of one object each by the names of their files."""
+    if folder is None:
+        raise InputError(f"the method {OWN_NETWORKS} needs networks: give a folder of them with --networks")
+    paths = sorted(folder.glob("*.safetensors"))
+    if not paths:
+        raise InputError(f"{folder} holds no network (OBJECT.safetensors)")
+    return {path.stem: load_model(path) for path in paths}
 
 
 def _objects(config: EvaluateConfig, problems: list[str]) -> list[ObjectImages]:

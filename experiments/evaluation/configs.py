@@ -6,6 +6,10 @@ electronics, industrial
 validation
     Command:   python -m experiments.build_data validation-bins; python -m experiments.tune_rivals validation
     Data:      25 components of the training's class, for choices: ablate, tune_rivals.
+per_object
+    Command:   python -m experiments.evaluate per_object --networks FOLDER, with gear_motor.safetensors and
+               bearing_housing.safetensors, from runs of the training config per_object
+    Data:      two of the industrial parts: what a network trained for one part alone finds.
 wrs
     Command:   python -m experiments.evaluate wrs --cad FOLDER_OF_WRS_MESHES
     Data:      the seven parts of the published out-of-class test, in bins made as those above.
@@ -33,6 +37,7 @@ from kmn_jax.checks import InputError
 
 Source = Literal["bop", "clouds"]
 METHODS = ("ours", "ours_ransac", "ours_no_normals", "ours_open3d", "fpfh", "fgr", "ppf", "kiss")
+OWN_NETWORKS = "per_object"  # a method, too, for which networks have to be given
 
 
 @dataclass(frozen=True)
@@ -66,8 +71,8 @@ class EvaluateConfig:
         if not self.methods:
             raise InputError(f"no method is named: there are {', '.join(METHODS)}")
         for name in self.methods:
-            if name not in METHODS:
-                raise InputError(f"there is no method {name!r}: there are {', '.join(METHODS)}")
+            if name not in (*METHODS, OWN_NETWORKS):
+                raise InputError(f"there is no method {name!r}: there are {', '.join(METHODS)} and {OWN_NETWORKS}")
         if len({*self.methods}) < len(self.methods) or len({*self.noise}) < len(self.noise):
             raise InputError("a method or a noise is named twice")
         if self.sensor is not None:
@@ -94,6 +99,12 @@ _ALL = (
     EvaluateConfig("electronics", folder=_SETS / "electronics"),
     EvaluateConfig("industrial", folder=_SETS / "industrial"),
     EvaluateConfig("validation", folder=Path("outputs/validation_bins/perfect"), crops=10, seed=7),
+    EvaluateConfig(
+        "per_object",
+        folder=_SETS / "industrial",
+        objects=("gear_motor", "bearing_housing"),
+        methods=("ours", OWN_NETWORKS, "fpfh"),
+    ),
     EvaluateConfig("wrs", folder=_SETS / "wrs", cad_names=_WRS),
     EvaluateConfig("clouds", source="clouds", noise=(0.0,)),
     EvaluateConfig("bop", noise=(0.0,)),

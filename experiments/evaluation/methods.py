@@ -17,10 +17,11 @@ from flax import nnx
 from jaxtyping import Float, Float32
 
 from experiments.evaluation.cases import Case
+from kmn_jax.checks import InputError
 from kmn_jax.data.cad import ObjectModel
 from kmn_jax.estimator.candidates import arrays_of
 from kmn_jax.estimator.crop_pose import CropPoseConfig, Said, crop_pose, matches_of, said_of_draws
-from kmn_jax.estimator.part import Part, make_part
+from kmn_jax.estimator.part import Part, make_part, model_digest
 from kmn_jax.estimator.result import CropPrediction
 from kmn_jax.estimator.search import PartArrays, SceneArrays
 from kmn_jax.estimator.view import padded_points
@@ -121,6 +122,26 @@ class Ours:
     @property
     def _num_points(self) -> int:
         return self.config.num_points or self.model.config.num_scene_points
+
+
+@dataclass(frozen=True)
+class OwnNetworks:
+    """For each object a network that was trained for it alone."""
+
+    name: str
+    models: Mapping[str, Model]  # by the objects' names
+    config: OursConfig = field(default_factory=OursConfig)
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """The networks, and what Ours says of itself."""
+        return {"networks": {name: model_digest(model) for name, model in self.models.items()}, **asdict(self.config)}
+
+    def prepare(self, model: ObjectModel) -> Solver:
+        """Prepare an object with its own network. Raises InputError if there is none."""
+        if model.name not in self.models:
+            raise InputError(f"there is no network of {model.name}: there are those of {', '.join(self.models)}")
+        return Ours(self.name, self.models[model.name], self.config).prepare(model)
 
 
 def padded(points: Float32[np.ndarray, "n 3"]) -> SceneArrays:

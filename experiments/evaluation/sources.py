@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -52,11 +52,11 @@ def bop_objects(folder: Path, split: str, report: Report, most_images: int | Non
             report(f"{folder.name}: image {key.image_id} of scene {key.scene_id} shows no object")
         for object_id in sorted(present & set(models)):
             keys[object_id].append(key)
-    names = _names(folder)
+    names = {object_id: _names(folder).get(object_id, f"object {object_id}") for object_id in models}
     found = [
         ObjectImages(
-            names.get(object_id, f"object {object_id}"),
-            model,
+            names[object_id],
+            replace(model, name=names[object_id]),
             BopImages(dataset, model, object_id, tuple(_spread(keys[object_id], most_images)), report),
         )
         for object_id, model in models.items()

@@ -31,6 +31,7 @@ class Source:
     name: str
     split: str
     path: Path
+    scenes: int = 0  # sources of one file, as of training and validation, have other scenes if this number differs
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ def _made(folder: Path, sources: list[Source], config: PackConfig, workers: int,
 def _make(folder: str, source: Source, config: PackConfig) -> Record:
     start = time.perf_counter()
     try:
-        item, facts = pack_object(source.path, source.name, source.split, config)
+        item, facts = pack_object(source.path, source.name, source.split, config, source.scenes)
     except InputError as error:
         return Record(source.name, source.split, time.perf_counter() - start, str(error), None, None)
     entry = write_object(folder, item)

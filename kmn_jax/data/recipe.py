@@ -62,11 +62,13 @@ class BuildFacts:
     floor_shares: list[float]
 
 
-def pack_object(path: str | Path, name: str, split: str, config: PackConfig) -> tuple[PackedObject, BuildFacts]:
+def pack_object(
+    path: str | Path, name: str, split: str, config: PackConfig, scenes: int = 0
+) -> tuple[PackedObject, BuildFacts]:
     """Make a pack's object of a CAD file: the surfels, and `config.drops` accepted scenes with their views.
 
-    The same file, name and config give the same bits on one machine. Raises InputError if the file is broken or a drop
-    is not accepted.
+    The same file, name, config and number of `scenes` give the same bits on one machine. Raises InputError if the file
+    is broken or a drop is not accepted.
     """
     clock = _Clock()
     with clock("model"):
@@ -75,14 +77,14 @@ def pack_object(path: str | Path, name: str, split: str, config: PackConfig) -> 
         shape = collision_shape(model.vertices, model.triangles, config.hulls)
     mesh = RayMesh(model.vertices, model.triangles)
     with clock("physics"):
-        scenes, results = bin_scenes(shape, config, int(model.digest[:8], 16))
-    item = replace(_without_drops(model, name, split), drops=tuple(Drop(scene) for scene in scenes))
+        drops, results = bin_scenes(shape, config, int(model.digest[:8], 16) + scenes)
+    item = replace(_without_drops(model, name, split), drops=tuple(Drop(scene) for scene in drops))
     with clock("visibility"):
         if config.visibility:
             exact = quantised(item)
             bits = [visibility_bits(mesh, exact, drop.scene, config.bin_surfels) for drop in exact.drops]
-            drops = (Drop(scene, *pair) for scene, pair in zip(scenes, bits, strict=True))
-            item = replace(item, drops=tuple(drops))
+            seen = (Drop(scene, *pair) for scene, pair in zip(drops, bits, strict=True))
+            item = replace(item, drops=tuple(seen))
     facts = BuildFacts(
         seconds=clock.seconds,
         hidden_share=model.hidden_share,

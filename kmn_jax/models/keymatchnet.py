@@ -34,12 +34,14 @@ from kmn_jax.typing import ArrayInput
 
 Normalization = Literal["metric", "released"]
 Inputs = Literal["raw", "invariant"]
+ObjectBranch = Literal["cad", "learned"]
 
 _LARGEST = 1e18  # a length whose square, summed over three axes, still fits float32
 
 _CHOICES = {
     "normalization": get_args(Normalization),
     "inputs": get_args(Inputs),
+    "object_branch": get_args(ObjectBranch),
     "graph": get_args(Graph),
     "compute": get_args(Compute),
     "pair_dropout": get_args(PairDropout),
@@ -56,6 +58,8 @@ class KeyMatchNetConfig:
         normalization: "metric" divides both clouds by one length, "released" is what the authors' weights need.
         inputs: "raw" coordinates and normals as published, or rotation "invariant" point pair features.
         graph: "dynamic" finds neighbours anew in feature space, "static" keeps those of the coordinates.
+        object_branch: where keypoint features come from: the "cad" cloud, or "learned", for one object that the
+            network is trained for, and its K fixed keypoints.
         compute: arithmetic of the layers; statistics, distances and logits are float32 in all.
         pair_dropout: one dropout mask for all keypoints of a point ("shared"), or "per_pair" as published.
     """
@@ -75,6 +79,7 @@ class KeyMatchNetConfig:
     normalization: Normalization = "metric"
     inputs: Inputs = "raw"
     graph: Graph = "dynamic"
+    object_branch: ObjectBranch = "cad"
     compute: Compute = "float32"
 
     def __post_init__(self) -> None:
@@ -154,8 +159,12 @@ class KeyMatchNet(nnx.Module):
             )
 
         self.scene = encoder(NUM_SCENE_INVARIANTS)
-        self.object = encoder(NUM_OBJECT_INVARIANTS)
-        self.object_out = NormalizedLinear(config.scene_width, config.object_width, config.groups, rngs=rngs)
+        if config.object_branch == "cad":
+            self.object = encoder(NUM_OBJECT_INVARIANTS)
+            self.object_out = NormalizedLinear(config.scene_width, config.object_width, config.groups, rngs=rngs)
+        else:
+            shape = config.num_keypoints, config.object_width
+            self.keypoints = nnx.Param(jax.random.normal(rngs.params(), shape))
         self.head = PairHead(config.scene_width, config.object_width, config.pair_width, config.groups, rngs=rngs)
 
     def encode_object(
@@ -165,8 +174,18 @@ class KeyMatchNet(nnx.Module):
         length: Float[Array, ""],
         key: jax.Array | None = None,
     ) -> Float[Array, "k o"]:
-        """Return one feature per keypoint. With a key, dropout acts before and after the last layer."""
+        """Return one feature per keypoint. With a key, dropout acts before and after the last layer.
+
+        A network of one object has features of its own, for as many keypoints as it was made with, whatever the cloud.
+        """
         config = self.config
+        if config.object_branch == "learned":
+            if keypoint_indices.shape[0] != config.num_keypoints:
+                raise InputError(
+                    f"{keypoint_indices.shape[0]} keypoints given, but this network was trained for one object and its"
+                    f" {config.num_keypoints}"
+                )
+            return self.keypoints[...]
         inputs: EncoderInputs
         if config.normalization == "released":
             inputs = raw_inputs(released_object(cloud))

@@ -108,9 +108,16 @@ def make_group(
         )
     object_key = jax.random.fold_in(jax.random.wrap_key_data(keys[0]), 1)
     diameter = jnp.asarray(pack.diameter)[row]
-    rows = _cloud_rows(jax.random.fold_in(object_key, 0), num_surfels, network.num_object_points, config)
+    fixed = network.object_branch == "learned"  # then the first surfels, as an object model has them
+    rows = _cloud_rows(
+        jax.random.fold_in(object_key, 0), num_surfels, network.num_object_points, config.plain() if fixed else config
+    )
     points, normals = jnp.asarray(pack.points)[row, rows], jnp.asarray(pack.normals)[row, rows]
-    indices = _keypoints(jax.random.fold_in(object_key, 1), points / diameter, network.num_keypoints, config)
+    indices = (
+        jnp.arange(network.num_keypoints, dtype=jnp.int32)
+        if fixed
+        else _keypoints(jax.random.fold_in(object_key, 1), points / diameter, network.num_keypoints, config)
+    )
     keypoints = points[indices]
 
     def of_scene(drop: Int[Array, ""], keys: UInt32[Array, "s 2"]) -> tuple[Array, ...]:

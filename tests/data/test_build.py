@@ -8,6 +8,7 @@ import time
 from multiprocessing import parent_process
 from pathlib import Path
 
+import numpy as np
 import pytest
 import trimesh
 
@@ -176,3 +177,14 @@ def test_refuses_a_recipe_that_cannot_be(fields: dict, message: str) -> None:
 def test_published_range_of_copies() -> None:
     assert PackConfig().copies_per_drop.tolist() == list(range(1, 21))
     assert PackConfig(drops=3, copies=(2, 4)).copies_per_drop.tolist() == [2, 3, 4]
+
+
+def test_sources_of_one_file_may_have_other_scenes(tmp_path: Path) -> None:
+    (source,) = box_sources(tmp_path / "cad", 1)
+    again = Source("again", "train", source.path)
+    other = Source("other", "validation", source.path, scenes=1)
+    build_pack(tmp_path / "pack", [source, again, other], CONFIG, workers=1)
+    pack = Pack(tmp_path / "pack")
+    first, same, different = (pack.load(name).drops[0].scene.T_bin_object for name in ("box0", "again", "other"))
+    np.testing.assert_array_equal(first, same)
+    assert np.abs(first - different).max() > 1e-3

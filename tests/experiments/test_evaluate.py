@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from experiments.evaluation.rivals import FastGlobal, Fpfh, Kiss, PointPairs, mi
 from experiments.evaluation.sources import bop_objects, cloud_objects
 from experiments.evaluation.tuned import RIVALS
 from kmn_jax.checks import InputError
+from kmn_jax.models import create_model, load_model, released_file, save_model
 from kmn_jax.pose import adi
 from tests.data.bop_sample import save_image
 
@@ -192,6 +195,24 @@ def test_rivals_are_tuned_by_settings_side_by_side(tmp_path: Path, monkeypatch: 
     assert set(settings) == {f"{name}{how}" for name in ("fpfh_0.05", "kiss_0.03") for how in ("", "_smoothed")}
     assert settings["fpfh_0.05_smoothed"]["features"]["smooth"]
     assert settings["fpfh_0.05"]["features"]["voxel"] == 0.05
+
+
+def test_networks_of_one_object_each_are_a_method(
+    tmp_path: Path, gear: ObjectImages, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An untrained one finds nothing much, but it is used for its object, and only there."""
+    config = replace(load_model(released_file("small")).config, object_branch="learned")
+    (tmp_path / "own").mkdir()
+    save_model(create_model(config, jax.random.key(0)), tmp_path / "own" / f"{GEAR}.safetensors")
+    options = ["demo", "--images", "1", "--crops", "2", "--methods", "per_object", "--output", str(tmp_path / "out")]
+    assert evaluate.main([*options, "--objects", GEAR, "--networks", str(tmp_path / "own")]) == 0
+    content = json.loads((tmp_path / "out" / "scores.json").read_text())
+    assert {cell["object"] for cell in content["cells"]} == {GEAR}
+    assert set(content["recipe"]["methods"]["per_object"]["networks"]) == {GEAR}
+    assert evaluate.main([*options, "--networks", str(tmp_path / "own"), "--overwrite"]) == 2
+    assert "there is no network of USB" in capsys.readouterr().err
+    assert evaluate.main(options) == 2
+    assert "--networks" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

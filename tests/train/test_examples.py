@@ -40,6 +40,17 @@ def group(stacked: StackedPack, seed: int, config: ExampleConfig, count: int = 4
     return found
 
 
+def test_a_network_of_one_object_has_the_same_keypoints_whatever_is_drawn(stacked: StackedPack) -> None:
+    network = replace(NETWORK, object_branch="learned")
+    drops = jnp.arange(4, dtype=jnp.int32)
+    for seed in range(3):
+        found: Group = make(stacked.arrays, jnp.int32(1), drops, keys(seed, 4), network, CONFIG)
+        np.testing.assert_array_equal(found.keypoint_indices, np.arange(6))
+        own = group(stacked, seed, CONFIG)
+        np.testing.assert_array_equal(found.crops, own.crops)  # what is drawn of the scenes is the same
+        assert (np.asarray(found.keypoint) < 6).all()
+
+
 def no_crops(count: int) -> RenderedCrops:
     nothing = jnp.zeros((count, 64), dtype=bool)
     flat = jnp.zeros((count, 64, 3))

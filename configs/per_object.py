@@ -1,0 +1,28 @@
+"""A network for one part: the trunk of `small` without the object branch, with features of its K keypoints learned.
+
+What the published comparison's networks trained for each object stand for: it shows what zero-shot costs.
+
+per_object
+    Command:   python -m experiments.build_data per-object --cad PART.stl --folder outputs/packs/PART
+               python -m experiments.train per_object --pack outputs/packs/PART --folder runs/PART
+    Hardware:  2 CPU cores. Not yet run.
+    Expected:  not yet known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from configs.small import small
+
+per_object = replace(
+    small,
+    name="per_object",
+    pack="outputs/packs/per_object",
+    num_steps=4_000,
+    network=replace(small.network, object_branch="learned"),
+    examples=replace(small.examples, rotate_object=False, object_shift=0.0, object_noise=0.0),
+    pipeline=replace(small.pipeline, samples_per_object=640),
+    validate_every=500,
+    validation_samples=320,
+)
