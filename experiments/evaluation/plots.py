@@ -26,16 +26,22 @@ def recall_plot(cells: Sequence[Cell], noises: Sequence[float]) -> bytes:
         over_noise.errorbar(places, recall, [recall - low, high - recall], label=method, lw=1.2, capsize=2, **style)
         seconds = np.concatenate([cell.seconds for cell in own])
         if len(seconds):
-            over_time.plot(
-                1e3 * seconds.mean(), recall[0], "o" if method.endswith("ICP") else "x", color=style["color"]
-            )
-            over_time.annotate(
-                method, (1e3 * seconds.mean(), recall[0]), xytext=(4, 3), textcoords="offset points", size=7
-            )
-    over_noise.set(xlabel="noise, % of the longest side", ylabel="recall (ADI below 0.1 diameters)", ylim=(0, 1.02))
-    over_noise.legend(fontsize=7)
-    over_time.set(xlabel="mean ms a crop, warm", xscale="log", ylabel=f"recall, noise {noises[0]:.0%}", ylim=(0, 1.02))
-    over_time.margins(x=0.25)
+            refined = method.endswith("ICP")
+            over_time.plot(1e3 * seconds.mean(), recall[0], "o" if refined else "x", color=style["color"])
+    over_noise.set(
+        title="dotted: without ICP",
+        xlabel="noise, % of the longest side",
+        ylabel="recall (ADI below 0.1 diameters)",
+        ylim=(0, 1.02),
+    )
+    figure.legend(*over_noise.get_legend_handles_labels(), loc="outside right upper", fontsize=7)
+    over_time.set(
+        title="crosses: without ICP",
+        xlabel="mean ms a crop, warm",
+        xscale="log",
+        ylabel=f"recall, noise {noises[0]:.0%}",
+        ylim=(0, 1.02),
+    )
     for axis in (over_noise, over_time):
         axis.grid(alpha=0.3)
     return as_png(canvas)
