@@ -91,8 +91,9 @@ def _chosen_cases(config: EvaluateConfig, objects: Sequence[ObjectImages], expor
         ranked = sorted((e, place, row) for place, own in enumerate(errors) for row, e in enumerate(own))
         if not ranked:
             continue
-        picks = {"best": ranked[0], "median": ranked[len(ranked) // 2], "worst": ranked[-1]}
-        # Of poses far from every copy, or none, all are equally bad: one of each of three objects is shown.
+        near = [case for case in ranked if np.isfinite(case[0])] or ranked
+        picks = {"best": ranked[0], "median": ranked[len(ranked) // 2], "worst": near[-1]}
+        # Poses far from every copy, and none at all, are equally bad: one of each of three objects is shown.
         lost = list({place: (e, place, row) for e, place, row in reversed(ranked) if not np.isfinite(e)}.values())
         picks |= {f"lost {number + 1}": pick for number, pick in enumerate(lost[:3])}
         for title, (error, place, row) in picks.items():
