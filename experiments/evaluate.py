@@ -19,7 +19,7 @@ import tyro
 from experiments.evaluation.cases import ObjectImages, limited
 from experiments.evaluation.configs import CONFIGS, OWN_NETWORKS, EvaluateConfig, find_config
 from experiments.evaluation.methods import ONE_RANSAC, Method, Ours, OursConfig, OwnNetworks
-from experiments.evaluation.predictions import Export, code_digest, export
+from experiments.evaluation.predictions import Export, code_digest, export, library_versions
 from experiments.evaluation.refinement import SETTINGS
 from experiments.evaluation.report import Result, draw_pictures, write_report
 from experiments.evaluation.rivals import OverMatches, missing
@@ -71,6 +71,7 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
         "data": _data_digest(config),
         "weights": model_digest(model),
         "code": code_digest(),
+        "versions": library_versions(),
         "methods": {key: method.settings for key, method in methods.items()},
         "refinement": {key: str(value) for key, value in SETTINGS.items()},
         "processor": processor(),

@@ -15,7 +15,7 @@ from experiments.evaluation.methods import Method
 from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kiss, PointPairs, missing
 from experiments.evaluation.tuned import RIVALS
 
-_VOXELS = {"fpfh": (0.03, 0.04, 0.05), "fgr": (0.025, 0.03, 0.04, 0.05), "kiss": (0.015, 0.02, 0.025, 0.035)}
+_VOXELS = {"fpfh": (0.03, 0.04, 0.05, 0.065), "fgr": (0.015, 0.02, 0.025, 0.03), "kiss": (0.01, 0.015, 0.02, 0.025)}
 _SCENE_SHARES = (0.2, 0.1, 0.05, 0.025)  # of PPF
 
 

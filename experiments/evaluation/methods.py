@@ -50,7 +50,7 @@ class Method(Protocol):
         """Return what solves cases of an object whose lengths are in the cases' unit."""
 
 
-# As published: one draw of points, one search, and its best pose is taken.
+# The published scheme after the same smoothing: one draw of points, one search, and its best pose is taken.
 ONE_RANSAC = CropPoseConfig(num_draws=1, num_modes=1, ransac=RansacConfig())
 
 

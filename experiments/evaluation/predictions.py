@@ -11,6 +11,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,10 +27,10 @@ from kmn_jax.files import read_safetensors, write_whole
 
 _ROOT = Path(__file__).parents[2]
 _CODE = (
-    *("kmn_jax/geometry", "kmn_jax/models", "kmn_jax/pose", "experiments/evaluation"),
-    *(f"kmn_jax/data/{name}.py" for name in ("crops", "smoothing", "splat", "cad", "scene")),
-    *(f"kmn_jax/estimator/{name}.py" for name in ("crop_pose", "search", "part", "view")),
+    *("kmn_jax/geometry", "kmn_jax/models", "kmn_jax/pose", "kmn_jax/data", "experiments/evaluation"),
+    *(f"kmn_jax/estimator/{name}.py" for name in ("candidates", "crop_pose", "search", "part", "view")),
 )
+_LIBRARIES = ("jax", "jaxlib", "numpy", "open3d", "opencv-contrib-python-headless", "kiss-matcher")
 # Of experiments/evaluation; what configs and tuned settings say is in the recipe.
 _NOT_POSES = ("scores.py", "report.py", "plots.py", "pictures.py", "published.py", "configs.py", "tuned.py")
 _HEADER = "kmn_jax evaluation 1"
@@ -91,6 +92,13 @@ class Export:
     def path(self, method: str, name: str, noise: float) -> Path:
         """Return the file of an object and noise."""
         return self.folder / _slug(method) / f"{_slug(name)}.noise{noise:g}.safetensors"
+
+    def has(self, method: str, name: str, noise: float) -> bool:
+        """Tell whether there is a file of an object and noise. Raises InputError if another recipe made it."""
+        if not self.path(method, name, noise).exists():
+            return False
+        self._read(method, name, noise)
+        return True
 
     def write_truth(self, name: str, noise: float, cases: Sequence[Case]) -> None:
         """Write the true poses of cases."""
@@ -164,9 +172,9 @@ def export(
     units = [(found, noise) for found in objects for noise in noises]
     bar = tqdm(total=len(units) * len(methods), unit="set", desc="poses")
     for found, noise in units:
-        missing = {key: method for key, method in methods.items() if not folder.path(key, found.name, noise).exists()}
+        missing = {key: method for key, method in methods.items() if not folder.has(key, found.name, noise)}
         bar.update(len(methods) - len(missing))
-        known = folder.path("cases", found.name, noise).exists()
+        known = folder.has("cases", found.name, noise)
         if not missing and known:
             continue
         cases = list(draw_cases(found, crops, noise, seed))
@@ -207,6 +215,18 @@ def code_digest() -> str:
         digest.update(path.relative_to(_ROOT).as_posix().encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def library_versions() -> dict[str, str | None]:
+    """Return the versions of the libraries that decide poses, None of those that are not there."""
+
+    def found(name: str) -> str | None:
+        try:
+            return version(name)
+        except PackageNotFoundError:
+            return None
+
+    return {name: found(name) for name in _LIBRARIES}
 
 
 def _sources() -> Iterator[Path]:

@@ -1,5 +1,7 @@
 """The rivals as they are compared: what found most poses after ICP on validation bins, see `experiments.tune_rivals`.
 
+But for point pair features, whose settings are the package's defaults.
+
 Apart from `rivals`, so that a setting that changes makes the poses of its own method stale and no others.
 """
 

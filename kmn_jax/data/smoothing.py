@@ -23,7 +23,7 @@ class SmoothConfig:
     most_radius: float = 0.25
     radius_per_noise: float = 5.0  # by which the radius grows with the noise's deviation
     probe_radius: float = 0.12  # of the balls in which noise is measured
-    probes: int = 64  # of them, around the first points
+    probes: int = 64  # of them, around points evenly spread over the rows
     quantile: float = 0.25  # of the probes' spreads is the noise: those at edges and corners spread more
     moved_noise: float = 0.03  # points of such a noise, and above, are moved onto their planes; of less, less
 
@@ -51,9 +51,12 @@ def smoothed(
 
     `cloud` is all that was measured around the points, and its noise the deviation along the normal, in its unit.
     """
+    # Rows are those of an image, from its top to its bottom: the first ones lie side by side.
     count = min(config.probes, points.shape[0])
-    probed = planes_within_radius(points[:count], cloud, config.probe_radius * diameter, cloud_mask)
-    spreads = jnp.where(probed.valid & mask[:count], probed.residuals, jnp.nan)
+    real = jnp.nonzero(mask, size=points.shape[0], fill_value=0)[0]
+    rows = real[jnp.arange(count, dtype=jnp.int32) * mask.sum(dtype=jnp.int32) // count]
+    probed = planes_within_radius(points[rows], cloud, config.probe_radius * diameter, cloud_mask)
+    spreads = jnp.where(probed.valid & mask[rows], probed.residuals, jnp.nan)
     measured = jnp.nanquantile(spreads, config.quantile)
     noise = jnp.where(jnp.isfinite(measured), measured, 0)
     radius = (config.least_radius * diameter) + config.radius_per_noise * noise

@@ -148,7 +148,9 @@ def crop_pose(
 
     def poses_of(item: tuple[Said, Key[Array, ""]]) -> PoseResult:
         draw, key = item
-        return ransac_modes(key, matches_of(draw, part, config.matches), config.num_modes, config.ransac)
+        matches = matches_of(draw, part, config.matches)
+        enough = matches._replace(mask=matches.mask & crop.valid)
+        return ransac_modes(key, enough, config.num_modes, config.ransac)
 
     keys = jax.random.split(pose_key, config.num_draws)
     poses, points, point_normals, mask, on_object = jax.tree.map(
@@ -176,5 +178,4 @@ def crop_pose(
 
     best = jnp.argmax(jax.lax.map(score_of, poses))
     found: PoseResult = jax.tree.map(lambda leaf: leaf[best], poses)
-    pose = jnp.where(found.converged, found.T_scene_object.at[:3, 3].add(crop.seed), found.T_scene_object)
-    return found._replace(T_scene_object=pose)
+    return found._replace(T_scene_object=found.T_scene_object.at[:3, 3].add(jnp.where(found.converged, crop.seed, 0)))

@@ -34,7 +34,10 @@ class SurfaceConfig:
 
 
 class SurfaceAgreement(NamedTuple):
-    """Shares, each from 0 to 1. What nothing was measured of, as behind other parts, speaks neither for nor against."""
+    """Shares, each from 0 to 1.
+
+    Surface that is hidden, or not measured, is not confirmed, but not seen through either.
+    """
 
     confirmed: Scalar  # of the object's surface that faces the camera: measured there, with a normal like its own
     seen_through: Scalar  # of the same: the camera measured something behind it

@@ -63,14 +63,25 @@ def test_no_unit_is_preferred(scale: float) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
-def test_too_few_points_stay_and_have_no_normal(count: int) -> None:
-    points = np.zeros((count, 3), dtype=np.float32)
+def test_points_far_from_each_other_stay_and_have_no_normal(count: int) -> None:
+    points = np.eye(3, dtype=np.float32)[np.arange(count) % 3] * np.arange(1, count + 1, dtype=np.float32)[:, None]
     there = np.ones(count, dtype=bool)
     moved, normals, known, noise = smooth(points, there, points, there, 1.0)
     np.testing.assert_array_equal(moved, points)
     assert not np.asarray(known).any()
     assert not np.asarray(normals).any()
     assert float(noise) == 0
+
+
+def test_noise_is_measured_all_over_not_where_the_rows_begin() -> None:
+    """The first rows, as an image's, lie along an edge: noise is that of the faces beyond."""
+    points, normal = tilted_plane(3000, 0.002)
+    rng = np.random.default_rng(1)
+    rough = rng.normal(0, 0.05, (200, 3)).astype(np.float32) + np.float32(5) * normal.astype(np.float32)
+    rows = np.concatenate([rough, points])
+    there = np.ones(len(rows), dtype=bool)
+    *_, measured = smooth(rows, there, rows, there, 1.0)
+    assert float(measured) == pytest.approx(0.002, rel=0.3)
 
 
 def test_padding_counts_nowhere() -> None:

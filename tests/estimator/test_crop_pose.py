@@ -9,17 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import nnx
 
 import experiments
 from experiments.evaluation.cases import Case, ObjectImages, draw_cases
 from experiments.evaluation.methods import padded
 from experiments.evaluation.sources import bop_objects
 from kmn_jax.estimator.candidates import arrays_of
-from kmn_jax.estimator.crop_pose import CropPoseConfig, crop_pose
+from kmn_jax.estimator.crop_pose import CropPoseConfig, crop_pose, matches_of, said_of_draws
 from kmn_jax.estimator.part import make_part
 from kmn_jax.estimator.search import PartArrays, SceneArrays
 from kmn_jax.models import Model, load_model, released_file
-from kmn_jax.pose import PoseResult, PoseStatus, adi
+from kmn_jax.pose import PoseResult, adi, ransac
 
 SMALL = Path(experiments.__file__).parent / "assets" / "small_test_set"
 CONFIG = CropPoseConfig(num_draws=2, num_modes=2)
@@ -75,14 +76,24 @@ def test_metres_and_millimetres_give_one_pose(model: Model, part: PartArrays, ca
 
 
 def test_one_draw_and_one_pose_are_the_published_search(model: Model, part: PartArrays, cases: list[Case]) -> None:
-    plain = replace(CONFIG, num_draws=1, num_modes=1, smooth=None)
-    assert solve(model, part, padded(cases[0].points), plain).status == PoseStatus.OK
+    plain, scene, key = replace(CONFIG, num_draws=1, num_modes=1), padded(cases[0].points), jax.random.key(0)
+    found = solve(model, part, scene, plain)
+    crop_key, pose_key = jax.random.split(key)
+    network = nnx.merge(model.graphdef, model.parameters)
+    crop, said = jax.jit(said_of_draws, static_argnums=(0, 4, 5))(network, part, scene, crop_key, 512, plain)
+    first = jax.tree.map(lambda leaf: leaf[0], said)
+    matches = matches_of(first, part, plain.matches)
+    alone = ransac(jax.random.split(pose_key, 1)[0], matches, plain.ransac)
+    assert alone.converged
+    np.testing.assert_allclose(found.T_scene_object[:3, :3], alone.T_scene_object[:3, :3], atol=1e-3)
+    shift = np.asarray(found.T_scene_object)[:3, 3] - np.asarray(crop.seed) - np.asarray(alone.T_scene_object)[:3, 3]
+    assert np.linalg.norm(shift) < 1e-3 * float(part.diameter)
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 5])
+@pytest.mark.parametrize("count", [0, 1, 2, 5, 12])
 def test_crops_of_next_to_nothing_have_no_pose(model: Model, part: PartArrays, count: int) -> None:
     points = np.zeros((16_384, 3), dtype=np.float32)
-    points[:count] = [[0, 0, 500]] + np.arange(count)[:, None] * [[1.0, 0, 0]]
+    points[:count] = np.random.default_rng(0).uniform(-5, 5, (count, 3)) + np.array([0, 0, 500])
     found = solve(model, part, SceneArrays(jnp.asarray(points), jnp.arange(len(points)) < count))
     assert not found.converged
     np.testing.assert_array_equal(found.T_scene_object, np.eye(4))
