@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from kmn_jax.checks import InputError, float_array, index_array, is_traced, mask_array, positive_scalar, row_count
 from kmn_jax.geometry.knn import largest_distance
+from kmn_jax.models.cloud_inputs import check_extent, cloud_array
 from kmn_jax.models.encoder import Encoder, Graph
 from kmn_jax.models.invariants import (
     NUM_OBJECT_INVARIANTS,
@@ -35,8 +36,6 @@ from kmn_jax.typing import ArrayInput
 Normalization = Literal["metric", "released"]
 Inputs = Literal["raw", "invariant"]
 ObjectBranch = Literal["cad", "learned"]
-
-_LARGEST = 1e18  # a length whose square, summed over three axes, still fits float32
 
 _CHOICES = {
     "normalization": get_args(Normalization),
@@ -269,12 +268,12 @@ def encode_object(
     Raises:
         InputError: wrong shapes, dtypes, values that are not finite, indices out of range, no extent.
     """
-    cloud = _cloud(object_cloud, "object_cloud")
+    cloud = cloud_array(object_cloud, "object_cloud")
     indices = index_array(keypoint_indices, "keypoint_indices", None, cloud.shape[0])
     if indices.shape[0] < 1:
         raise InputError("keypoint_indices is empty: choose at least one keypoint")
     graphdef, parameters = _pair(model)
-    _check_extent(jnp.ptp(cloud[:, :3], axis=0).max(), "object_cloud")
+    check_extent(jnp.ptp(cloud[:, :3], axis=0).max(), "object_cloud")
     length = _diameter(cloud[:, :3]) if length is None else positive_scalar(length, "length")
     return _encode_object(graphdef, parameters, cloud, indices, length.astype(jnp.float32))
 
@@ -302,12 +301,12 @@ def encode_scene(
         InputError: wrong shapes, dtypes, values that are not finite, fewer than one real point, no extent.
     """
     given = None if mask is None else mask_array(mask, "mask", row_count(scene_crop, "scene_crop"))
-    crop = _cloud(scene_crop, "scene_crop", given)
+    crop = cloud_array(scene_crop, "scene_crop", given)
     if given is not None and not is_traced(given) and not bool(given.any()):
         raise InputError("mask is all false: scene_crop has no real point")
     graphdef, parameters = _pair(model)
     radius = _crop_radius(crop, given)
-    _check_extent(radius, "scene_crop")
+    check_extent(radius, "scene_crop")
     length = radius if length is None else positive_scalar(length, "length")
     return _encode_scene(graphdef, parameters, crop, length.astype(jnp.float32), given)
 
@@ -393,19 +392,3 @@ _diameter = jax.jit(largest_distance)
 def _crop_radius(crop: Float[Array, "n 6"], mask: Bool[Array, " n"] | None) -> Float[Array, ""]:
     distance = jnp.sqrt((crop[:, :3] ** 2).sum(axis=1))
     return (distance if mask is None else jnp.where(mask, distance, 0)).max()
-
-
-def _check_extent(extent: Float[Array, ""], name: str) -> None:
-    if is_traced(extent):
-        return
-    if float(extent) == 0:
-        raise InputError(f"{name} has no extent: all of its points coincide")
-    if not float(extent) < _LARGEST:
-        raise InputError(f"{name} is too large for float32: use a larger unit of length")
-
-
-def _cloud(value: ArrayInput, name: str, mask: jax.Array | None = None) -> Float[Array, "n 6"]:
-    cloud = float_array(value, name, (None, 6), mask=mask)
-    if cloud.shape[0] == 0:
-        raise InputError(f"{name} is empty: at least one point is needed")
-    return cloud.astype(jnp.float32)

@@ -70,9 +70,10 @@ def test_metres_and_millimetres_give_one_pose(model: Model, part: PartArrays, ca
     small = part._replace(points=part.points * 1e-3, diameter=part.diameter * 1e-3)
     one = solve(model, part, padded(cases[0].points))
     other = solve(model, small, padded(cases[0].points * np.float32(1e-3)))
-    np.testing.assert_allclose(other.T_scene_object[:3, :3], one.T_scene_object[:3, :3], atol=0.02)
-    shift = other.T_scene_object[:3, 3] * 1e3 - one.T_scene_object[:3, 3]
-    assert np.linalg.norm(shift) < 0.02 * float(part.diameter)
+    # Rounding may choose other triplets: the poses are the same to a gate's share, not to the digit.
+    scaled = np.array(other.T_scene_object)
+    scaled[:3, 3] *= 1e3
+    assert float(adi(scaled, one.T_scene_object, part.points)) < 0.05 * float(part.diameter)
 
 
 def test_one_draw_and_one_pose_are_the_published_search(model: Model, part: PartArrays, cases: list[Case]) -> None:
