@@ -26,6 +26,7 @@ from kmn_jax.pose import Matches
 
 _LEAST_POINTS = 10  # of a thinned crop
 _SMOOTHED_BY = 4096  # points of a crop
+_SMOOTHED = (1024, 2048, 4096, 8192)  # points of a padded thinned crop
 
 
 @dataclass(frozen=True)
@@ -172,6 +173,7 @@ class Kiss:
 
         # In diameters: the package takes bounds on noise above 1 for mistakes.
         settings = kiss_matcher.KISSMatcherConfig(self.voxel)
+        compile_smoothing(self.features)
         source = (model.points / model.diameter).astype(np.float32)
 
         def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
@@ -278,7 +280,7 @@ def _smoothed(thinned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "p 3"
 
     origin = points[0].astype(np.float64)
     rows = np.random.default_rng(0).choice(len(points), min(_SMOOTHED_BY, len(points)), replace=False)
-    few, mask = padded_points((thinned - origin).astype(np.float32), 1024)
+    few, mask = padded_points((thinned - origin).astype(np.float32), _SMOOTHED[0])
     many, there = padded_points((points[rows] - origin).astype(np.float32), _SMOOTHED_BY)
     moved, normals, known, _ = jax.device_get(_smooth(few, mask, many, there, np.float32(diameter)))
     real = np.asarray(mask) & known
@@ -289,6 +291,16 @@ def _smoothed(thinned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "p 3"
 
 
 _smooth = jax.jit(smoothed)
+
+
+def compile_smoothing(settings: FeatureSettings | None) -> None:
+    """Compile for all sizes of a thinned crop, if it is to be smoothed, before a solver's time is taken."""
+    if settings is None or not settings.smooth:
+        return
+    many, there = padded_points(np.zeros((1, 3), np.float32), _SMOOTHED_BY)
+    for size in _SMOOTHED:
+        few, mask = padded_points(np.zeros((1, 3), np.float32), size)
+        jax.block_until_ready(_smooth(few, mask, many, there, np.float32(1)))
 
 
 def described(
@@ -314,6 +326,7 @@ def _described_solver(
     """Return a solver that describes a crop and registers the object, which is described once."""
     open3d = quiet_open3d()
     source = described(model.points, model.normals, settings, model.diameter)
+    compile_smoothing(settings)
 
     def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
         open3d.utility.random.seed(case.random_seed % 2**31)

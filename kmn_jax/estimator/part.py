@@ -82,8 +82,13 @@ def model_digest(model: Model) -> str:
 
 
 def make_part(found: ObjectModel, model: Model, digest: str | None = None) -> Part:
-    """Encode an object. Raises InputError if it has fewer points than the network takes."""
+    """Encode an object.
+
+    Raises InputError if it has fewer points than the network takes, or the network was trained for another one.
+    """
     config = model.config
+    if config.object_digest not in ("", found.digest):
+        raise InputError(f"this network was trained for one object, and {found.name} is of another CAD file")
     count = config.num_object_points
     if len(found.points) < count:
         raise InputError(f"{found.name} has {len(found.points)} points, but this network takes {count}: make more")

@@ -59,6 +59,7 @@ class KeyMatchNetConfig:
         graph: "dynamic" finds neighbours anew in feature space, "static" keeps those of the coordinates.
         object_branch: where keypoint features come from: the "cad" cloud, or "learned", for one object that the
             network is trained for, and its K fixed keypoints.
+        object_digest: SHA-256 of that object's CAD file; empty for networks of any object.
         compute: arithmetic of the layers; statistics, distances and logits are float32 in all.
         pair_dropout: one dropout mask for all keypoints of a point ("shared"), or "per_pair" as published.
     """
@@ -79,6 +80,7 @@ class KeyMatchNetConfig:
     inputs: Inputs = "raw"
     graph: Graph = "dynamic"
     object_branch: ObjectBranch = "cad"
+    object_digest: str = ""
     compute: Compute = "float32"
 
     def __post_init__(self) -> None:
@@ -102,6 +104,8 @@ class KeyMatchNetConfig:
             raise ValueError(
                 'inputs "invariant" need normalization "metric": "released" scales the axes of space unevenly'
             )
+        if self.object_digest and self.object_branch == "cad":
+            raise ValueError("object_digest names the object of a network with learned features, which this is not")
         if self.num_keypoints > self.num_object_points:
             raise ValueError(
                 f"{self.num_keypoints} keypoints cannot be drawn from {self.num_object_points} object points"

@@ -29,6 +29,7 @@ from kmn_jax.checks import InputError
 from kmn_jax.data.pipeline import BatchIterator, SampleIndex
 from kmn_jax.files import write_whole
 from kmn_jax.models import save_model
+from kmn_jax.models.keymatchnet import model_structure
 from kmn_jax.train.checkpoint import Checkpoints
 from kmn_jax.train.config import TrainConfig
 from kmn_jax.train.records import MetricFiles, check_config, check_same, write_config, write_session
@@ -43,7 +44,7 @@ from kmn_jax.train.sharding import (
     put_whole,
 )
 from kmn_jax.train.snapshot import Snapshot, from_first_process
-from kmn_jax.train.sources import ignore, training_source, validation_source
+from kmn_jax.train.sources import ignore, trained_network, training_source, validation_source
 from kmn_jax.train.step import Metrics, Samples, create_state, index_of, mean_metrics, total_sums
 from kmn_jax.train.stop import StopRequest
 from kmn_jax.train.transfer import FILE_LIMIT, MANIFEST, export_snapshot, import_snapshot
@@ -151,6 +152,7 @@ class _Run:
             source(config, mesh, lambda problem: self.report(f"left out: {problem}"))
             for source in (training_source, validation_source)
         )
+        self.saved_graphdef = model_structure(trained_network(config)).graphdef
         optimizer, num_steps = config.optimizer, config.num_steps
         self.graphdef, state = create_state(config.step, optimizer.build(num_steps))
         self.state = put_whole(state, mesh)
@@ -217,7 +219,7 @@ class _Run:
             while not self._at_boundary():
                 self._advance()
         if self.first:
-            save_model((self.graphdef, self.state.average), self.folder / "last.safetensors")
+            save_model((self.saved_graphdef, self.state.average), self.folder / "last.safetensors")
         return Outcome(self.step, self.stopped, self.best_loss, self.best_step)
 
     def export(self, folder: Path) -> None:
@@ -324,7 +326,7 @@ class _Run:
     def _save(self, best: bool) -> None:
         # The model first: a run that is killed in between validates again, and writes both.
         if best and self.first:
-            save_model((self.graphdef, self.state.average), self.folder / "model.safetensors")
+            save_model((self.saved_graphdef, self.state.average), self.folder / "model.safetensors")
         self.checkpoints.save(self._snapshot(), best=best)
         self.saved = self.step
 

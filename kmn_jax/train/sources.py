@@ -13,6 +13,7 @@ from kmn_jax.checks import InputError
 from kmn_jax.data.device_pack import DevicePack, StackedPack, stack_pack
 from kmn_jax.data.pack import Pack
 from kmn_jax.data.pipeline import PipelineConfig, SampleBatches, SampleIndex
+from kmn_jax.models.keymatchnet import KeyMatchNetConfig
 from kmn_jax.train.config import TrainConfig
 from kmn_jax.train.rendered import rendered_frames
 from kmn_jax.train.sharding import put_whole
@@ -58,6 +59,22 @@ def validation_source(config: TrainConfig, mesh: Mesh, report: Report = ignore) 
     stacked = stack_pack(Pack(config.pack), "validation", _with_bits(config))
     pipeline = replace(config.pipeline, samples_per_object=config.validation_samples, seed=_VALIDATION_SEED)
     return _source(config, stacked, pipeline, mesh, report, ordered=True)
+
+
+def trained_network(config: TrainConfig) -> KeyMatchNetConfig:
+    """Return the network's config as it is saved: one of learned features knows the CAD file of its object.
+
+    Raises InputError if such a network is to be trained with more than one object.
+    """
+    if config.network.object_branch == "cad" or config.rendered is not None:
+        return config.network
+    pack = Pack(config.pack)
+    digests = {pack.load(name, visibility=False).digest for name in pack.names()}
+    if len(digests) != 1:
+        raise InputError(
+            f"the pack {config.pack} holds {len(digests)} objects, but a network with learned features is of one"
+        )
+    return replace(config.network, object_digest=digests.pop())
 
 
 def _check_surfels(config: TrainConfig, stacked: StackedPack) -> None:

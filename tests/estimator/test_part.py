@@ -63,6 +63,14 @@ def test_the_digest_is_of_parameters_wherever_they_come_from(model: Model, tmp_p
     assert model_digest(other) != model_digest(model)
 
 
+def test_a_network_of_one_object_refuses_others(shaft: ObjectModel) -> None:
+    own = replace(CONFIG, object_branch="learned", object_digest=shaft.digest)
+    assert make_part(shaft, create_model(own, jax.random.key(0))).num_keypoints == 8
+    other = create_model(replace(own, object_digest="0" * 64), jax.random.key(0))
+    with pytest.raises(InputError, match="this network was trained for one object, and shaft is of another CAD file"):
+        make_part(shaft, other)
+
+
 def test_a_card_of_other_weights_is_refused_with_what_renews_it(part: Part, tmp_path: Path) -> None:
     path = tmp_path / "shaft.kmn"
     save_part(part, path)

@@ -16,7 +16,7 @@ from kmn_jax.models import create_model, encode_object, load_model, save_model
 from tests.reference.clouds import box_cloud
 from tests.reference.networks import TINY
 
-LEARNED = replace(TINY, object_branch="learned")
+LEARNED = replace(TINY, object_branch="learned", object_digest="1" * 64)
 
 
 def test_the_cloud_counts_for_nothing_and_the_keypoints_are_its_own() -> None:
@@ -52,3 +52,8 @@ def test_files_keep_it(tmp_path: Path) -> None:
     again = load_model(tmp_path / "one.safetensors")
     assert again.config == LEARNED
     np.testing.assert_array_equal(again.parameters["keypoints"][...], model.parameters["keypoints"][...])
+
+
+def test_a_network_of_any_object_names_none() -> None:
+    with pytest.raises(ValueError, match="object_digest"):
+        replace(TINY, object_digest="1" * 64)
