@@ -237,7 +237,8 @@ dl { display: grid; grid-template-columns: max-content 1fr; gap: .1rem 1rem; fon
 dt { color: #666; } dd { margin: 0; overflow-wrap: anywhere; }
 .wide { overflow-x: auto; } table { border-collapse: collapse; font-size: .85rem; }
 th, td { border-bottom: 1px solid #ddd; padding: .25rem .6rem; text-align: left; vertical-align: top; }
-th { border-bottom: 2px solid #888; white-space: nowrap; } td:not(:first-child) { min-width: 5.5rem; }
+th { border-bottom: 2px solid #888; overflow-wrap: anywhere; } th:not(:first-child) { min-width: 4rem; }
+td:first-child { white-space: nowrap; }
 img { max-width: 100%; }
 </style>
 </head>

@@ -135,11 +135,11 @@ def recall_rows(cells: Sequence[Cell], objects: str) -> list[dict[str, Any]]:
 
 
 def object_rows(cells: Sequence[Cell], noise: float) -> list[dict[str, Any]]:
-    """Return a table's rows: for each object, the recall of each method at one noise."""
+    """Return a table's rows: for each method, the recall of each object at one noise."""
     rows = []
-    for name in dict.fromkeys(cell.object for cell in cells):
-        own = [cell for cell in cells if cell.object == name and cell.noise == noise]
-        rows.append({"object": name, **{cell.method: cell_text(cell, "diameter") for cell in own}})
+    for method in dict.fromkeys(cell.method for cell in cells):
+        own = [cell for cell in cells if cell.method == method and cell.noise == noise]
+        rows.append({"method": method, **{cell.object: cell_text(cell, "diameter") for cell in own}})
     return rows
 
 

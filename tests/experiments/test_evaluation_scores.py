@@ -96,7 +96,9 @@ def test_tables_and_where_others_find_more() -> None:
     assert rows[0]["noise 0%"].startswith("0.85 (")
     assert rows[0]["crops"] == 200
     assert rows[0]["mean ms"] == pytest.approx(10)
-    assert [row["object"] for row in object_rows(cells, 0.0)] == ["a", "b"]
+    by_object = object_rows(cells, 0.0)
+    assert [list(row) for row in by_object] == [["method", "a", "b"]] * 2
+    assert by_object[1]["b"].startswith("0.91 (")
     assert pooled([cells[0], cells[2]], "all").recall() == pytest.approx(0.85)
     lines = beaten_by(cells, "kmn_jax + ICP")
     assert len(lines) == 2
