@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
@@ -14,6 +15,9 @@ from jaxtyping import install_import_hook
 
 install_import_hook("kmn_jax", "beartype.beartype")
 
+_MEMORY_MAPS = Path("/proc/self/maps")
+_MANY_MAPS = 15_000
+
 # A product of float32 and an accidental float64 or int32 array, or a (n,) added to a (n, 3), is a bug here.
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -21,9 +25,10 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_what_was_compiled() -> Iterator[None]:
-    """Keep a process small: thousands of compiled programs take gigabytes and most of the memory maps allowed."""
+    """Forget compiled programs before they take all the memory maps that Linux allows a process (65,530)."""
     yield
-    jax.clear_caches()
+    if _MEMORY_MAPS.exists() and _MEMORY_MAPS.read_bytes().count(b"\n") > _MANY_MAPS:
+        jax.clear_caches()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
