@@ -6,6 +6,7 @@ import difflib
 
 from configs.base import base
 from configs.debug import debug
+from configs.normalization import normalization_metric, normalization_released
 from configs.paper import paper, paper_tenth
 from configs.per_object import per_object
 from configs.small import small
@@ -13,7 +14,8 @@ from kmn_jax.checks import InputError
 from kmn_jax.train.config import TrainConfig
 
 CONFIGS: dict[str, TrainConfig] = {
-    config.name: config for config in (paper, paper_tenth, base, small, per_object, debug)
+    config.name: config
+    for config in (paper, paper_tenth, base, small, per_object, normalization_metric, normalization_released, debug)
 }
 
 

@@ -1,7 +1,7 @@
 """What each choice of our pipeline is worth: `python -m experiments.ablate NAME`, a name of `experiments.evaluate`.
 
 One choice at a time is changed; recall and time as in an evaluation, under outputs/ablation/NAME. Not among them:
-input normalisation ("released" against "metric"), which a network has to be trained with.
+input normalisation ("released" against "metric"), which a network is trained with: configs/normalization.py.
 """
 
 from __future__ import annotations

@@ -15,8 +15,13 @@ from experiments.evaluation.methods import Method
 from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kiss, PointPairs, missing
 from experiments.evaluation.tuned import RIVALS
 
-_VOXELS = {"fpfh": (0.03, 0.04, 0.05, 0.065), "fgr": (0.015, 0.02, 0.025, 0.03), "kiss": (0.01, 0.015, 0.02, 0.025)}
-_SCENE_SHARES = (0.2, 0.1, 0.05, 0.025)  # of PPF
+# Of each rival, voxels without smoothing and with it; finer where the coarse end of a first look was the worse one.
+_VOXELS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
+    "fpfh": ((0.03, 0.04, 0.05, 0.065), (0.03, 0.04, 0.05, 0.065)),
+    "fgr": ((0.015, 0.02, 0.025, 0.03), (0.025,)),
+    "kiss": ((0.015, 0.025), (0.01, 0.015, 0.02)),
+}
+_PAIRS = tuple((sampling, share) for sampling in (0.1, 0.07) for share in (0.2, 0.05))  # of PPF
 
 
 def methods_of(name: str) -> dict[str, Method]:
@@ -26,10 +31,12 @@ def methods_of(name: str) -> dict[str, Method]:
         of_smooth = ", smoothed" if smooth else ""
         if name == "ppf":
             features = replace(PointPairs().features, smooth=smooth)
-            titles = [(f"PPF {share:g}{of_smooth}", share) for share in _SCENE_SHARES]
-            methods += [PointPairs(title, scene_share=share, features=features) for title, share in titles]
+            methods += [
+                PointPairs(f"PPF {sampling:g} {share:g}{of_smooth}", sampling, share, features)
+                for sampling, share in _PAIRS
+            ]
             continue
-        for voxel in _VOXELS[name]:
+        for voxel in _VOXELS[name][smooth]:
             title = f"{name} {voxel:g}{of_smooth}"
             features = FeatureSettings(voxel=voxel, smooth=smooth)
             if name == "kiss":

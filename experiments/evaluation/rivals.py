@@ -118,10 +118,13 @@ class FastGlobal:
 
 @dataclass(frozen=True)
 class PointPairs:
-    """Point pair features and voting (OpenCV's ppf_match_3d); the best pose is taken."""
+    """Point pair features and voting (OpenCV's ppf_match_3d); the best pose is taken.
+
+    A finer sampling than this one, as the package's 0.05, takes minutes to hash a part with large flat faces.
+    """
 
     name: str = "PPF"
-    sampling: float = 0.05  # of model and votes' distances
+    sampling: float = 0.07  # of model and votes' distances
     scene_share: float = 0.2  # of the scene's points are reference points
     features: FeatureSettings = FeatureSettings()
 
@@ -131,11 +134,8 @@ class PointPairs:
         return asdict(self)
 
     def prepare(self, model: ObjectModel) -> Solver:
-        """Hash the model's pairs; solving samples and votes."""
-        import cv2
-
-        detector = cv2.ppf_match_3d.PPF3DDetector(self.sampling, self.sampling)
-        detector.trainModel(np.concatenate([model.points, model.normals], axis=1).astype(np.float32))
+        """Hash the model's pairs, once for all noises and settings of the search; solving samples and votes."""
+        detector = _hashed(model, self.sampling)
 
         def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
             target = thinned_cloud(case.points, None, self.features, model.diameter)
@@ -152,6 +152,22 @@ class PointPairs:
             return pose if np.isfinite(pose).all() else None
 
         return solve
+
+
+_last_hashed: dict[tuple[str, float], Any] = {}  # of one object, as one after another is evaluated
+
+
+def _hashed(model: ObjectModel, sampling: float) -> Any:
+    import cv2
+
+    name = model.digest, sampling
+    if all(digest != model.digest for digest, _ in _last_hashed):
+        _last_hashed.clear()
+    if name not in _last_hashed:
+        detector = cv2.ppf_match_3d.PPF3DDetector(sampling, sampling)
+        detector.trainModel(np.concatenate([model.points, model.normals], axis=1).astype(np.float32))
+        _last_hashed[name] = detector
+    return _last_hashed[name]
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """The rivals as they are compared: what found most poses after ICP on validation bins, see `experiments.tune_rivals`.
 
-But for point pair features, whose settings are the package's defaults.
+Of point pair features no finer sampling than the default of `PointPairs` was tried: see there.
 
 Apart from `rivals`, so that a setting that changes makes the poses of its own method stale and no others.
 """

@@ -188,7 +188,7 @@ def test_an_ablation_changes_one_choice_at_a_time(tmp_path: Path, monkeypatch: p
 
 
 def test_rivals_are_tuned_by_settings_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tune_rivals, "_VOXELS", {"fpfh": (0.05,), "kiss": (0.03,)})
+    monkeypatch.setattr(tune_rivals, "_VOXELS", {"fpfh": ((0.05,), (0.05,)), "kiss": ((0.03,), (0.03,))})
     options = ["demo", "--objects", GEAR, "--images", "1", "--crops", "2", "--output", str(tmp_path / "out")]
     assert tune_rivals.main(options) == 0
     settings = json.loads((tmp_path / "out" / "scores.json").read_text())["recipe"]["methods"]

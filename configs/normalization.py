@@ -1,0 +1,29 @@
+"""One choice of the network that no trained one can be asked about: how input coordinates are scaled.
+
+normalization_metric, normalization_released
+    Command:   python -m experiments.build_data electronics --limit 120 --folder outputs/packs/electronics_120
+               python -m experiments.train normalization_metric --folder runs/normalization_metric
+               python -m experiments.evaluate validation --methods ours
+                   --weights runs/normalization_metric/last.safetensors, and the same with normalization_released.
+    Hardware:  2 CPU cores. Not yet run.
+    Expected:  not yet known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from configs.small import small
+
+# Raw coordinates, as invariant inputs need "metric" anyhow; few objects and samples, so to be compared only with
+# each other.
+normalization_metric, normalization_released = (
+    replace(
+        small,
+        name=f"normalization_{normalization}",
+        pack="outputs/packs/electronics_120",
+        num_steps=2_000,
+        network=replace(small.network, inputs="raw", normalization=normalization),
+    )
+    for normalization in ("metric", "released")
+)
