@@ -15,7 +15,7 @@ from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kis
 # By the names of the methods: the package that is needed, and what makes the rival.
 RIVALS: Mapping[str, tuple[str, Callable[[], Any]]] = {
     "fpfh": ("open3d", lambda: Fpfh(features=FeatureSettings(voxel=0.05))),
-    "fgr": ("open3d", lambda: FastGlobal(features=FeatureSettings(voxel=0.025))),
+    "fgr": ("open3d", lambda: FastGlobal(features=FeatureSettings(voxel=0.02))),
     "ppf": ("cv2.ppf_match_3d", PointPairs),
     "kiss": ("kiss_matcher", lambda: Kiss(voxel=0.015, features=FeatureSettings(voxel=0.01, smooth=True))),
 }
