@@ -19,7 +19,7 @@ from experiments.evaluation.pictures import Shown, case_grid
 from experiments.evaluation.plots import recall_plot
 from experiments.evaluation.predictions import Export
 from experiments.evaluation.published import MILLISECONDS, RECALL, SOURCE
-from experiments.evaluation.scores import Cell, case_errors, object_rows, pooled, recall_rows
+from experiments.evaluation.scores import Cell, case_errors, object_rows, pooled, recall_rows, seed_rows
 from kmn_jax.files import write_whole
 from kmn_jax.report import markdown_table, print_table
 
@@ -28,6 +28,10 @@ _GATES = (
     "A pose is right if its ADI to the nearest copy is below a tenth of the object's diameter, in the second column of "
     "each noise below a tenth of its bounding box's diagonal. In brackets: Wilson's 95% interval. Times are of one "
     "crop after another, warm, with the object prepared beforehand; rows with ICP include it, the same for all."
+)
+_SEEDS = (
+    "The share of crops in which the pose is right, within a tenth of the diameter, and of the very copy that the crop "
+    "is around; above, a neighbour that is seen better counts as well, as a robot may pick it."
 )
 
 
@@ -124,6 +128,7 @@ def _sections(result: Result) -> list[tuple[str, str, list[dict[str, Any]]]]:
         lines = [*beaten_by(whole, own), *lines]
         text = "\n".join(f"- {line}" for line in lines) or "Nowhere."
         sections.append((f"Where another method finds more than {own}", text, []))
+    sections.append(("On the copy that the crop is around", _SEEDS, seed_rows(cells)))
     for noise in config.noise:
         sections.append((f"By object, noise {noise:.0%}", "", object_rows(cells, noise)))
     left_out = [f"{name}: {reason}" for name, reason in result.skipped.items()] + list(result.problems)

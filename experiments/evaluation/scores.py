@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from experiments.bins import adi_of_pairs
 from experiments.evaluation.predictions import Export, Predictions, Truth
@@ -28,6 +28,7 @@ class Cell:
     object: str
     noise: float
     errors: Float[np.ndarray, " c"]  # ADI to the nearest copy, in diameters; infinite where no pose was found
+    on_seed: Bool[np.ndarray, " c"]  # whether that copy is the one that the crop is around
     diagonal: Float[np.ndarray, " c"]  # of the object's bounding box, in diameters
     seconds: Float[np.ndarray, " c"]
 
@@ -38,6 +39,10 @@ class Cell:
     def interval(self, gate: str = "diameter") -> tuple[float, float]:
         """Return Wilson's 95% interval of the recall."""
         return wilson(int(self._right(gate).sum()), len(self.errors))
+
+    def seed_recall(self) -> float:
+        """Return the share of poses that are right, within a tenth of the diameter, on the copy the crop is around."""
+        return float((self._right("diameter") & self.on_seed).mean()) if len(self.errors) else float("nan")
 
     def _right(self, gate: str) -> np.ndarray:
         size = self.diagonal if gate == "diagonal" else np.ones_like(self.errors)
@@ -58,7 +63,8 @@ def wilson(right: int, total: int) -> tuple[float, float]:
 def pooled(cells: Sequence[Cell], name: str) -> Cell:
     """Return cells of one method and noise as one."""
     first = cells[0]
-    columns = [np.concatenate([getattr(cell, field) for cell in cells]) for field in ("errors", "diagonal", "seconds")]
+    fields = ("errors", "on_seed", "diagonal", "seconds")
+    columns = [np.concatenate([getattr(cell, field) for cell in cells]) for field in fields]
     return Cell(first.method, name, first.noise, *columns)
 
 
@@ -75,36 +81,44 @@ def cells_of(
                 coarse, refined = (
                     _errors(poses, found, truth, model) for poses in (found.T_camera_object, found.refined)
                 )
-                size = np.full(len(coarse), model.diagonal / model.diameter)
-                cells.append(Cell(title, name, noise, coarse, size, found.seconds))
+                size = np.full(len(coarse.errors), model.diagonal / model.diameter)
+                cells.append(Cell(title, name, noise, *coarse, size, found.seconds))
                 total = found.seconds + found.refine_seconds
-                cells.append(Cell(f"{title} + ICP", name, noise, refined, size, total))
+                cells.append(Cell(f"{title} + ICP", name, noise, *refined, size, total))
     return cells
 
 
 def case_errors(folder: Export, name: str, noise: float, method: str, model: ObjectModel) -> Float[np.ndarray, " c"]:
     """Return the errors of refined poses, case by case."""
     found = folder.read(method, name, noise)
-    return _errors(found.refined, found, folder.truth(name, noise), model)
+    return _errors(found.refined, found, folder.truth(name, noise), model).errors
 
 
-def _errors(
-    poses: Float[np.ndarray, "c 4 4"], found: Predictions, truth: Truth, model: ObjectModel
-) -> Float[np.ndarray, " c"]:
-    """Return the ADI of each pose to the nearest copy of its scan, in diameters."""
+class _Errors(NamedTuple):
+    errors: Float[np.ndarray, " c"]
+    on_seed: Bool[np.ndarray, " c"]
+
+
+def _errors(poses: Float[np.ndarray, "c 4 4"], found: Predictions, truth: Truth, model: ObjectModel) -> _Errors:
+    """Return the ADI of each pose to the nearest copy of its scan, in diameters, and whether that is the seed's."""
     middle = np.append((model.minimum + model.maximum) / 2, 1)
-    pairs, rows = [], []
-    for row, (pose, copies) in enumerate(zip(poses, truth.T_camera_object, strict=True)):
+    pairs: list[np.ndarray] = []
+    rows: list[int] = []
+    of_seed: list[bool] = []
+    for row, (pose, copies, seed) in enumerate(zip(poses, truth.T_camera_object, truth.copy, strict=True)):
         if not found.found[row]:
             continue
         away = np.linalg.norm((copies @ middle - pose @ middle)[:, :3], axis=1)
-        near = copies[away <= _REACH * model.diameter]
-        pairs += [np.stack([pose, copy]) for copy in near]
+        near = np.flatnonzero(away <= _REACH * model.diameter).tolist()
+        pairs += [np.stack([pose, copies[copy]]) for copy in near]
         rows += [row] * len(near)
-    errors = np.full(len(poses), np.inf)
+        of_seed += [copy == seed for copy in near]
+    errors, own = np.full(len(poses), np.inf), np.full(len(poses), np.inf)
     if pairs:
-        np.minimum.at(errors, rows, _adi(np.stack(pairs), model) / model.diameter)
-    return errors
+        each, is_own = _adi(np.stack(pairs), model) / model.diameter, np.array(of_seed)
+        np.minimum.at(errors, rows, each)
+        np.minimum.at(own, np.array(rows)[is_own], each[is_own])
+    return _Errors(errors, np.isfinite(own) & (own <= errors))
 
 
 def _adi(pairs: Float[np.ndarray, "p 2 4 4"], model: ObjectModel) -> Float[np.ndarray, " p"]:
@@ -131,6 +145,17 @@ def recall_rows(cells: Sequence[Cell], objects: str) -> list[dict[str, Any]]:
         row["median ms"] = float(np.median(everything) * 1e3) if len(everything) else None
         row["crops"] = len(everything)
         rows.append(row)
+    return rows
+
+
+def seed_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
+    """Return a table's rows: for each method, right poses of the very copies that the crops are around."""
+    rows = []
+    for method in dict.fromkeys(cell.method for cell in cells):
+        own = [cell for cell in cells if cell.method == method]
+        noises = dict.fromkeys(cell.noise for cell in own)
+        shares = {noise: pooled([cell for cell in own if cell.noise == noise], "").seed_recall() for noise in noises}
+        rows.append({"method": method, **{f"noise {noise:.0%}": f"{share:.2f}" for noise, share in shares.items()}})
     return rows
 
 

@@ -56,13 +56,15 @@ def test_a_pose_is_right_on_any_copy_and_only_within_the_gate(exported: Export, 
     np.testing.assert_allclose(coarse.errors[[0, 1, 2, 4]], 0, atol=1e-5)
     assert coarse.errors[3] == pytest.approx(0.25, abs=1e-4)
     assert coarse.recall() == pytest.approx(4 / 6)
+    assert coarse.seed_recall() == pytest.approx(3 / 6)
+    np.testing.assert_array_equal(coarse.on_seed, [True, True, True, True, False, False])
     assert refined.recall() == pytest.approx(5 / 6)
     np.testing.assert_allclose(refined.seconds, 2 * coarse.seconds)
     np.testing.assert_array_equal(case_errors(exported, "box", NOISE, "ours", model), refined.errors)
 
 
 def test_the_gate_by_the_diagonal_is_the_wider_one(model: ObjectModel) -> None:
-    cell = Cell("m", "o", 0.0, np.array([0.05, 0.105, 0.2]), np.full(3, 1.1), np.ones(3))
+    cell = Cell("m", "o", 0.0, np.array([0.05, 0.105, 0.2]), np.ones(3, bool), np.full(3, 1.1), np.ones(3))
     assert cell.recall("diameter") == pytest.approx(1 / 3)
     assert cell.recall("diagonal") == pytest.approx(2 / 3)
 
@@ -81,7 +83,7 @@ def test_an_interval_of_nothing_is_everything() -> None:
 
 def cell(method: str, name: str, right: int, total: int = 100) -> Cell:
     errors = np.where(np.arange(total) < right, 0.0, np.inf)
-    return Cell(method, name, 0.0, errors, np.ones(total), np.full(total, 0.01))
+    return Cell(method, name, 0.0, errors, errors < 1, np.ones(total), np.full(total, 0.01))
 
 
 def test_tables_and_where_others_find_more() -> None:
