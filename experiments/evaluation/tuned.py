@@ -1,6 +1,6 @@
 """The rivals as they are compared: what found most poses after ICP on validation bins, see `experiments.tune_rivals`.
 
-Of point pair features no finer sampling than the default of `PointPairs` was tried: see there.
+Point pair features have not been tuned yet; no finer sampling than their default is likely to be, see `PointPairs`.
 
 Apart from `rivals`, so that a setting that changes makes the poses of its own method stale and no others.
 """
