@@ -73,7 +73,8 @@ class EvaluateConfig:
         for name in self.methods:
             if name not in (*METHODS, OWN_NETWORKS):
                 raise InputError(f"there is no method {name!r}: there are {', '.join(METHODS)} and {OWN_NETWORKS}")
-        if len({*self.methods}) < len(self.methods) or len({*self.noise}) < len(self.noise):
+        names = {f"{100 * level:g}" for level in self.noise}  # of files and columns, too
+        if len({*self.methods}) < len(self.methods) or len(names) < len(self.noise):
             raise InputError("a method or a noise is named twice")
         if self.sensor is not None:
             _ = self.sensor_place

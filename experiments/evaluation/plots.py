@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.evaluation.scores import Cell, pooled
+from experiments.evaluation.scores import Cell, noise_name, pooled
 from kmn_jax.checks import InputError
 
 
@@ -41,7 +41,7 @@ def recall_plot(cells: Sequence[Cell], noises: Sequence[float]) -> bytes:
         title="crosses: without ICP",
         xlabel="mean ms a crop, warm",
         xscale="log",
-        ylabel=f"recall, noise {noises[0]:.0%}",
+        ylabel=f"recall, {noise_name(noises[0])}",
         ylim=(0, 1.02),
     )
     over_time.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))

@@ -19,7 +19,7 @@ from experiments.evaluation.pictures import Shown, case_grid
 from experiments.evaluation.plots import recall_plot
 from experiments.evaluation.predictions import Export
 from experiments.evaluation.published import MILLISECONDS, RECALL, SOURCE
-from experiments.evaluation.scores import Cell, case_errors, object_rows, pooled, recall_rows, seed_rows
+from experiments.evaluation.scores import Cell, case_errors, noise_name, object_rows, pooled, recall_rows, seed_rows
 from kmn_jax.files import write_whole
 from kmn_jax.report import markdown_table, print_table
 
@@ -81,7 +81,7 @@ def beaten_by(cells: Sequence[Cell], own: str) -> list[str]:
             continue
         apart = cell.interval()[0] > ours.interval()[1]
         found.append(
-            f"{cell.object}, noise {cell.noise:.0%}: {cell.method} {cell.recall():.2f}, {own} {ours.recall():.2f}"
+            f"{cell.object}, {noise_name(cell.noise)}: {cell.method} {cell.recall():.2f}, {own} {ours.recall():.2f}"
             f" ({'beyond' if apart else 'within'} the intervals)"
         )
     return found
@@ -105,7 +105,7 @@ def _chosen_cases(config: EvaluateConfig, objects: Sequence[ObjectImages], expor
             case = list(draw_cases(found, config.crops, noise, config.seed))[row]
             poses = exported.read(_SHOWN, found.name, noise)
             pose = poses.refined[row] if poses.found[row] else None
-            chosen.append(Shown(f"{title}, noise {noise:.0%}", found.model, case, pose, float(error)))
+            chosen.append(Shown(f"{title}, {noise_name(noise)}", found.model, case, pose, float(error)))
     return chosen
 
 
@@ -130,7 +130,7 @@ def _sections(result: Result) -> list[tuple[str, str, list[dict[str, Any]]]]:
         sections.append((f"Where another method finds more than {own}", text, []))
     sections.append(("On the copy that the crop is around", _SEEDS, seed_rows(cells)))
     for noise in config.noise:
-        sections.append((f"By object, noise {noise:.0%}", "", object_rows(cells, noise)))
+        sections.append((f"By object, {noise_name(noise)}", "", object_rows(cells, noise)))
     left_out = [f"{name}: {reason}" for name, reason in result.skipped.items()] + list(result.problems)
     sections.append(("Left out", "\n".join(f"- {line}" for line in left_out) or "Nothing.", []))
     settings = [

@@ -60,6 +60,11 @@ def wilson(right: int, total: int) -> tuple[float, float]:
     return max(min(float(middle - half), share), 0.0), min(max(float(middle + half), share), 1.0)
 
 
+def noise_name(noise: float) -> str:
+    """Return what a noise, a share of the object's longest side, is called in tables: "noise 0.4%"."""
+    return f"noise {100 * noise:g}%"
+
+
 def pooled(cells: Sequence[Cell], name: str) -> Cell:
     """Return cells of one method and noise as one."""
     first = cells[0]
@@ -138,8 +143,8 @@ def recall_rows(cells: Sequence[Cell], objects: str) -> list[dict[str, Any]]:
         row: dict[str, Any] = {"method": method}
         for noise in dict.fromkeys(cell.noise for cell in own):
             whole = pooled([cell for cell in own if cell.noise == noise], objects)
-            row[f"noise {noise:.0%}"] = cell_text(whole, "diameter")
-            row[f"noise {noise:.0%}, by diagonal"] = f"{whole.recall('diagonal'):.2f}"
+            row[noise_name(noise)] = cell_text(whole, "diameter")
+            row[f"{noise_name(noise)}, by diagonal"] = f"{whole.recall('diagonal'):.2f}"
         everything = np.concatenate([cell.seconds for cell in own])
         row["mean ms"] = float(everything.mean() * 1e3) if len(everything) else None
         row["median ms"] = float(np.median(everything) * 1e3) if len(everything) else None
@@ -155,7 +160,7 @@ def seed_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
         own = [cell for cell in cells if cell.method == method]
         noises = dict.fromkeys(cell.noise for cell in own)
         shares = {noise: pooled([cell for cell in own if cell.noise == noise], "").seed_recall() for noise in noises}
-        rows.append({"method": method, **{f"noise {noise:.0%}": f"{share:.2f}" for noise, share in shares.items()}})
+        rows.append({"method": method, **{noise_name(noise): f"{share:.2f}" for noise, share in shares.items()}})
     return rows
 
 

@@ -244,6 +244,13 @@ def test_bad_input_is_one_sentence(
 
 
 def test_settings_that_contradict_each_other_are_refused() -> None:
-    for values in ({"methods": ("fpfh", "fpfh")}, {"noise": ()}, {"images": 0}, {"sensor": "1,2"}, {"methods": ()}):
+    for values in (
+        {"methods": ("fpfh", "fpfh")},
+        {"noise": ()},
+        {"noise": (0.1, 0.1 + 1e-12)},
+        {"images": 0},
+        {"sensor": "1,2"},
+        {"methods": ()},
+    ):
         with pytest.raises(InputError):
             EvaluateConfig("x", **values)  # type: ignore[arg-type]

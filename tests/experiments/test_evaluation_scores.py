@@ -9,8 +9,19 @@ import pytest
 
 from experiments.evaluation.cases import Case
 from experiments.evaluation.predictions import Export, Predictions
+from experiments.evaluation.published import RECALL
 from experiments.evaluation.report import beaten_by
-from experiments.evaluation.scores import Cell, case_errors, cells_of, object_rows, pooled, recall_rows, wilson
+from experiments.evaluation.scores import (
+    Cell,
+    case_errors,
+    cells_of,
+    noise_name,
+    object_rows,
+    pooled,
+    recall_rows,
+    seed_rows,
+    wilson,
+)
 from kmn_jax.checks import InputError
 from kmn_jax.data.cad import ObjectModel
 from tests.data.bop_sample import box_model
@@ -81,9 +92,9 @@ def test_an_interval_of_nothing_is_everything() -> None:
     assert wilson(0, 0) == (0.0, 1.0)
 
 
-def cell(method: str, name: str, right: int, total: int = 100) -> Cell:
+def cell(method: str, name: str, right: int, total: int = 100, noise: float = 0.0) -> Cell:
     errors = np.where(np.arange(total) < right, 0.0, np.inf)
-    return Cell(method, name, 0.0, errors, errors < 1, np.ones(total), np.full(total, 0.01))
+    return Cell(method, name, noise, errors, errors < 1, np.ones(total), np.full(total, 0.01))
 
 
 def test_tables_and_where_others_find_more() -> None:
@@ -106,6 +117,14 @@ def test_tables_and_where_others_find_more() -> None:
     assert len(lines) == 2
     assert "beyond" in lines[0]
     assert "within" in lines[1]
+
+
+def test_small_noises_have_columns_of_their_own() -> None:
+    cells = [cell("FPFH", "a", right, noise=noise) for noise, right in ((0.0, 90), (0.004, 80), (0.07, 10))]
+    (row,), (seeds,) = recall_rows(cells, "all"), seed_rows(cells)
+    assert [row[name][:4] for name in ("noise 0%", "noise 0.4%", "noise 7%")] == ["0.90", "0.80", "0.10"]
+    assert list(seeds) == ["method", "noise 0%", "noise 0.4%", "noise 7%"]
+    assert {*RECALL["industrial"][0]} == {"method", *map(noise_name, (0.0, 0.01, 0.05))}
 
 
 def test_a_method_can_be_added_and_one_of_other_settings_is_refused(tmp_path: Path, model: ObjectModel) -> None:
