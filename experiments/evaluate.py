@@ -81,10 +81,8 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
     titles = {key: method.name for key, method in methods.items()}
     cells = cells_of(exported, {found.name: found.model for found in objects}, titles, config.noise)
     used = {**exported.recipe, "methods": {key: exported.recipe["methods"][key] for key in methods}}
-    result = Result(config, environment(), used, cells, skipped, tuple(problems))
-    own = methods.get("ours")
-    pictures = draw_pictures(result, objects, exported, own if isinstance(own, Ours) else None)
-    return write_report(folder, result, pictures)
+    result = Result(config, environment(), used, cells, skipped, tuple(problems), methods)
+    return write_report(folder, result, draw_pictures(result, objects, exported))
 
 
 def _methods(config: EvaluateConfig, model: Model, networks: Path | None) -> tuple[dict[str, Method], dict[str, str]]:

@@ -1,4 +1,4 @@
-"""The best, the median and the worst cases of a method, as pictures: what was seen, what was said of it, the pose."""
+"""Cases of a method as pictures: what was seen, what was said of it, the pose, and a rival's where that is right."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from jaxtyping import Float
 from experiments.evaluation.cases import Case
 from experiments.evaluation.methods import Ours
 from experiments.evaluation.plots import as_png, new_figure
+from experiments.evaluation.scores import THRESHOLD
 from kmn_jax.data.cad import ObjectModel
 from kmn_jax.estimator.part import Part
 from kmn_jax.estimator.picture_legend import draw_part
@@ -20,6 +21,16 @@ from kmn_jax.estimator.result import Detection
 from kmn_jax.estimator.truth import TRUTH_COLORS, truth_codes
 
 _DOT = 3.0
+_RIGHT, _WRONG, _RIVAL = "tab:green", "tab:red", "tab:blue"
+
+
+@dataclass(frozen=True)
+class RivalPose:
+    """What another method found in the same case."""
+
+    method: str
+    T_camera_object: Float[np.ndarray, "4 4"]
+    error: float  # ADI in diameters
 
 
 @dataclass(frozen=True)
@@ -31,6 +42,7 @@ class Shown:
     case: Case
     T_camera_object: Float[np.ndarray, "4 4"] | None
     error: float  # ADI in diameters
+    rival: RivalPose | None = None
 
 
 def case_grid(method: Ours, shown: Sequence[Shown]) -> bytes:
@@ -40,7 +52,10 @@ def case_grid(method: Ours, shown: Sequence[Shown]) -> bytes:
     for row, one in zip(grid, shown, strict=True):
         _draw(row, method, one)
     handles = [_dot(color, name) for name, color in TRUTH_COLORS.items()]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9)
+    handles += [_dot(_RIGHT, "our pose, right"), _dot(_WRONG, "our pose, wrong")]
+    if any(one.rival is not None for one in shown):
+        handles.append(_dot(_RIVAL, "the other method's pose"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=9)
     return as_png(canvas)
 
 
@@ -59,16 +74,20 @@ def _draw(row: Sequence[Any], method: Ours, one: Shown) -> None:
     _scatter(row[4], points, np.full((len(points), 3), 0.8), _verdict(one), box=points)
     if one.T_camera_object is not None:
         placed = _seen(part, one.T_camera_object)
-        color = "tab:green" if one.error < 0.1 else "tab:red"
-        row[4].scatter(*_plane(placed, points), s=_DOT, c=color, lw=0)
+        row[4].scatter(*_plane(placed, points), s=_DOT, c=_RIGHT if one.error < THRESHOLD else _WRONG, lw=0)
+    if one.rival is not None:
+        placed = _seen(part, one.rival.T_camera_object)
+        row[4].scatter(*_plane(placed, points), s=_DOT, c=_RIVAL, lw=0)
 
 
 def _verdict(one: Shown) -> str:
     if one.T_camera_object is None:
-        return "no pose"
-    if not np.isfinite(one.error):
-        return "pose: far from every copy"
-    return f"pose: ADI {one.error:.3f} diameters"
+        ours = "no pose"
+    elif not np.isfinite(one.error):
+        ours = "pose: far from every copy"
+    else:
+        ours = f"pose: ADI {one.error:.3f} diameters"
+    return ours if one.rival is None else f"{ours}\n{one.rival.method}: ADI {one.rival.error:.3f} diameters"
 
 
 def _seen(part: Part, T_camera_object: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:
@@ -123,7 +142,7 @@ def _scatter(
         axis.set_facecolor((0.35, 0.37, 0.4))
 
 
-def _dot(color: tuple[float, float, float], name: str) -> Any:
+def _dot(color: tuple[float, float, float] | str, name: str) -> Any:
     from matplotlib.lines import Line2D
 
     return Line2D([], [], ls="", marker="o", color=color, markeredgecolor="0.5", label=name)

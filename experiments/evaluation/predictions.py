@@ -32,7 +32,10 @@ _CODE = (
 )
 _LIBRARIES = ("jax", "jaxlib", "numpy", "open3d", "opencv-contrib-python-headless", "kiss-matcher")
 # Of experiments/evaluation; what configs and tuned settings say is in the recipe.
-_NOT_POSES = ("scores.py", "report.py", "plots.py", "pictures.py", "published.py", "configs.py", "tuned.py")
+_NOT_POSES = (
+    *("scores.py", "report.py", "chosen.py", "plots.py", "pictures.py", "published.py"),
+    *("configs.py", "tuned.py"),
+)
 _HEADER = "kmn_jax evaluation 1"
 _OF_METHOD = "method "
 

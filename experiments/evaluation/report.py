@@ -5,25 +5,25 @@ from __future__ import annotations
 import base64
 import html
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.evaluation.cases import ObjectImages, draw_cases
+from experiments.evaluation.cases import ObjectImages
+from experiments.evaluation.chosen import OURS, chosen_cases
 from experiments.evaluation.configs import EvaluateConfig
-from experiments.evaluation.methods import Ours
-from experiments.evaluation.pictures import Shown, case_grid
+from experiments.evaluation.methods import Method, Ours
+from experiments.evaluation.pictures import case_grid
 from experiments.evaluation.plots import recall_plot
 from experiments.evaluation.predictions import Export
 from experiments.evaluation.published import MILLISECONDS, RECALL, SOURCE
-from experiments.evaluation.scores import Cell, case_errors, noise_name, object_rows, pooled, recall_rows, seed_rows
+from experiments.evaluation.scores import Cell, noise_name, object_rows, pooled, recall_rows, seed_rows
 from kmn_jax.files import write_whole
 from kmn_jax.report import markdown_table, print_table
 
-_SHOWN = "ours"  # the method whose cases are drawn, if it ran
 _GATES = (
     "A pose is right if its ADI to the nearest copy is below a tenth of the object's diameter, in the second column of "
     "each noise below a tenth of its bounding box's diagonal. In brackets: Wilson's 95% interval. Times are of one "
@@ -45,6 +45,7 @@ class Result:
     cells: Sequence[Cell]
     skipped: Mapping[str, str]  # why methods could not run
     problems: Sequence[str]  # what of the data was left out
+    methods: Mapping[str, Method]  # that ran, by their keys
 
 
 def write_report(folder: Path, result: Result, pictures: Mapping[str, bytes]) -> Path:
@@ -60,53 +61,37 @@ def write_report(folder: Path, result: Result, pictures: Mapping[str, bytes]) ->
     return page
 
 
-def draw_pictures(
-    result: Result, objects: Sequence[ObjectImages], exported: Export, method: Ours | None
-) -> dict[str, bytes]:
+def draw_pictures(result: Result, objects: Sequence[ObjectImages], exported: Export) -> dict[str, bytes]:
     """Return the plot and the grid of cases by the names of their files."""
     pictures = {"recall": recall_plot(result.cells, result.config.noise)}
-    if method is not None:
-        shown = _chosen_cases(result.config, objects, exported)
+    method = result.methods.get(OURS)
+    if isinstance(method, Ours):
+        titles = {key: method.name for key, method in result.methods.items()}
+        shown = chosen_cases(result.config, objects, exported, result.cells, titles, _rivals(result))
         if shown:
             pictures["cases"] = case_grid(method, shown)
     return pictures
 
 
-def beaten_by(cells: Sequence[Cell], own: str) -> list[str]:
-    """Return a sentence for each object and noise at which another method's recall is higher than that of `own`."""
+def beaten_by(cells: Sequence[Cell], own: str, others: Collection[str]) -> list[str]:
+    """Return a sentence for each object, noise and gate at which one of the others' recall is higher than our own."""
+    ours = {(cell.object, cell.noise): cell for cell in cells if cell.method == own}
     found = []
-    for cell in cells:
-        ours = next(c for c in cells if (c.method, c.object, c.noise) == (own, cell.object, cell.noise))
-        if cell.method.startswith("kmn_jax") or cell.recall() <= ours.recall():
+    for gate, cell in ((gate, cell) for gate in ("diameter", "diagonal") for cell in cells if cell.method in others):
+        beside = ours[cell.object, cell.noise]
+        if not cell.recall(gate) > beside.recall(gate):
             continue
-        apart = cell.interval()[0] > ours.interval()[1]
+        apart = cell.interval(gate)[0] > beside.interval(gate)[1]
         found.append(
-            f"{cell.object}, {noise_name(cell.noise)}: {cell.method} {cell.recall():.2f}, {own} {ours.recall():.2f}"
-            f" ({'beyond' if apart else 'within'} the intervals)"
+            f"{cell.object}, {noise_name(cell.noise)}, by {gate}: {cell.method} {cell.recall(gate):.2f},"
+            f" {own} {beside.recall(gate):.2f} ({'beyond' if apart else 'within'} the intervals)"
         )
     return found
 
 
-def _chosen_cases(config: EvaluateConfig, objects: Sequence[ObjectImages], exported: Export) -> list[Shown]:
-    """Return the best, the median and the worst case over all objects, at the least noise and at the most."""
-    chosen = []
-    for noise in dict.fromkeys((min(config.noise), max(config.noise))):
-        errors = [case_errors(exported, found.name, noise, _SHOWN, found.model) for found in objects]
-        ranked = sorted((e, place, row) for place, own in enumerate(errors) for row, e in enumerate(own))
-        if not ranked:
-            continue
-        near = [case for case in ranked if np.isfinite(case[0])] or ranked
-        picks = {"best": ranked[0], "median": ranked[len(ranked) // 2], "worst": near[-1]}
-        # Poses far from every copy, and none at all, are equally bad: one of each of three objects is shown.
-        lost = list({place: (e, place, row) for e, place, row in reversed(ranked) if not np.isfinite(e)}.values())
-        picks |= {f"lost {number + 1}": pick for number, pick in enumerate(lost[:3])}
-        for title, (error, place, row) in picks.items():
-            found = objects[place]
-            case = list(draw_cases(found, config.crops, noise, config.seed))[row]
-            poses = exported.read(_SHOWN, found.name, noise)
-            pose = poses.refined[row] if poses.found[row] else None
-            chosen.append(Shown(f"{title}, {noise_name(noise)}", found.model, case, pose, float(error)))
-    return chosen
+def _rivals(result: Result) -> list[str]:
+    """Return the keys of methods that are no form of our pipeline with the same network."""
+    return [key for key, method in result.methods.items() if not isinstance(method, Ours)]
 
 
 def _sections(result: Result) -> list[tuple[str, str, list[dict[str, Any]]]]:
@@ -117,17 +102,8 @@ def _sections(result: Result) -> list[tuple[str, str, list[dict[str, Any]]]]:
     sections = [(f"Recall on {len(objects)} objects, {config.crops} crops of each", _GATES, rows)]
     if config.name in RECALL:
         sections.append(("Published", f"{SOURCE}. {MILLISECONDS}.", RECALL[config.name]))
-    own = next((cell.method for cell in cells if cell.method == "kmn_jax + ICP"), None)
-    if own is not None:
-        lines = beaten_by(cells, own)
-        whole = [
-            pooled([c for c in cells if c.method == method and c.noise == noise], "all objects")
-            for method in dict.fromkeys(cell.method for cell in cells)
-            for noise in config.noise
-        ]
-        lines = [*beaten_by(whole, own), *lines]
-        text = "\n".join(f"- {line}" for line in lines) or "Nowhere."
-        sections.append((f"Where another method finds more than {own}", text, []))
+    if OURS in result.methods:
+        sections += _comparisons(result, f"{result.methods[OURS].name} + ICP")
     sections.append(("On the copy that the crop is around", _SEEDS, seed_rows(cells)))
     for noise in config.noise:
         sections.append((f"By object, {noise_name(noise)}", "", object_rows(cells, noise)))
@@ -137,6 +113,27 @@ def _sections(result: Result) -> list[tuple[str, str, list[dict[str, Any]]]]:
         {"method": name, "settings": json.dumps(values)} for name, values in result.recipe["methods"].items()
     ] + [{"method": "ICP of all", "settings": json.dumps(result.recipe["refinement"])}]
     sections.append(("Settings; lengths are shares of the diameter", "", settings))
+    return sections
+
+
+def _comparisons(result: Result, own: str) -> list[tuple[str, str, list[dict[str, Any]]]]:
+    """Return where rivals find more than our own, and where other forms of it do, these for all objects together."""
+    cells = result.cells
+    rivals = {f"{result.methods[key].name}{refined}" for key in _rivals(result) for refined in ("", " + ICP")}
+    methods = dict.fromkeys(cell.method for cell in cells)
+    whole = [
+        pooled([c for c in cells if c.method == method and c.noise == noise], "all objects")
+        for method in methods
+        for noise in result.config.noise
+    ]
+    sections: list[tuple[str, str, list[dict[str, Any]]]] = []
+    for who, compared, others in (
+        ("another method", [*whole, *cells], rivals),
+        ("another form of ours", whole, {*methods} - rivals - {own}),
+    ):
+        text = "\n".join(f"- {line}" for line in beaten_by(compared, own, others)) or "Nowhere."
+        if others:
+            sections.append((f"Where {who} finds more than {own}", text, []))
     return sections
 
 

@@ -93,12 +93,6 @@ def cells_of(
     return cells
 
 
-def case_errors(folder: Export, name: str, noise: float, method: str, model: ObjectModel) -> Float[np.ndarray, " c"]:
-    """Return the errors of refined poses, case by case."""
-    found = folder.read(method, name, noise)
-    return _errors(found.refined, found, folder.truth(name, noise), model).errors
-
-
 class _Errors(NamedTuple):
     errors: Float[np.ndarray, " c"]
     on_seed: Bool[np.ndarray, " c"]
