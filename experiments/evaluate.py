@@ -11,6 +11,7 @@ import hashlib
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +25,7 @@ from experiments.evaluation.refinement import SETTINGS
 from experiments.evaluation.report import Result, draw_pictures, write_report
 from experiments.evaluation.rivals import OverMatches, missing
 from experiments.evaluation.scores import cells_of
-from experiments.evaluation.sources import bop_objects, cloud_objects
+from experiments.evaluation.sources import Report, bop_objects, cloud_objects
 from experiments.evaluation.tuned import RIVALS
 from experiments.test_sets import build_test_set
 from kmn_jax.checks import InputError
@@ -65,7 +66,7 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
     config = options.config
     folder = options.output or Path("outputs") / "evaluation" / config.name
     problems: list[str] = []
-    objects = _objects(config, problems)
+    objects = _objects(config, partial(_note, problems))
     recipe = {
         "config": {key: value for key, value in asdict(config).items() if key not in ("methods", "name")},
         "data": _data_digest(config),
@@ -78,6 +79,9 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
     }
     exported = Export.open(folder, recipe, options.overwrite)
     export(objects, methods, config.noise, config.crops, config.seed, exported)
+    for found, noise in ((found, noise) for found in objects for noise in config.noise):
+        for problem in exported.truth(found.name, noise).problems:
+            _note(problems, problem)
     titles = {key: method.name for key, method in methods.items()}
     cells = cells_of(exported, {found.name: found.model for found in objects}, titles, config.noise)
     used = {**exported.recipe, "methods": {key: exported.recipe["methods"][key] for key in methods}}
@@ -127,17 +131,19 @@ def _own_networks(folder: Path | None) -> dict[str, Model]:
     return {path.stem: load_model(path) for path in paths}
 
 
-def _objects(config: EvaluateConfig, problems: list[str]) -> list[ObjectImages]:
-    def report(problem: str) -> None:
-        if problem not in problems:
-            problems.append(problem)
-            print(f"left out: {problem}", file=sys.stderr)
+def _note(problems: list[str], problem: str) -> None:
+    """Tell what is left out, once."""
+    if problem not in problems:
+        problems.append(problem)
+        print(f"left out: {problem}", file=sys.stderr)
 
+
+def _objects(config: EvaluateConfig, report: Report) -> list[ObjectImages]:
     if config.folder is None:
         raise InputError(f"{config.name} needs a folder: give it with --folder")
     if config.source == "clouds":
         place, images = config.sensor_place, config.images
-        found = cloud_objects(config.folder, config.object, config.camera, config.units, place, report, images)
+        found = cloud_objects(config.folder, config.object, config.camera, config.units, place, images)
     else:
         if config.cad is not None and not config.folder.exists():
             _make_bins(config.folder, config.cad, config.cad_names)

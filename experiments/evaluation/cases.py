@@ -7,12 +7,14 @@ was measured within a diameter of the seed, without the background that is known
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
+from kmn_jax.checks import InputError
 from kmn_jax.data.cad import ObjectModel
 
 UNIT = "mm"
@@ -33,13 +35,23 @@ class Image:
     visible: Float[np.ndarray, " i"]  # share of each copy that is seen; NaN where it is not known
 
 
+class Images(Protocol):
+    """The scans of an object, each read when it is asked for."""
+
+    def __len__(self) -> int:
+        """Return how many there are, readable or not."""
+
+    def __getitem__(self, row: int, /) -> Image:
+        """Read a scan. Raises InputError if it cannot be used."""
+
+
 @dataclass(frozen=True)
 class ObjectImages:
-    """An object and its scans, read one by one."""
+    """An object and its scans."""
 
     name: str
     model: ObjectModel
-    images: Iterable[Image]
+    images: Images
 
 
 @dataclass(frozen=True)
@@ -58,16 +70,26 @@ class Case:
         return zlib.crc32(self.name.encode())
 
 
-def draw_cases(found: ObjectImages, crops: int, noise: float, seed: int = 0) -> Iterator[Case]:
+def draw_cases(
+    found: ObjectImages, crops: int, noise: float, seed: int = 0, report: Callable[[str], None] | None = None
+) -> Iterator[Case]:
     """Yield so many crops of an object, evenly many of each scan, with Gaussian noise of a share of its longest side.
 
-    The same arguments give the same cases, and the same seeds at every noise. Scans on which no copy can be seen are
-    passed over, so there may be fewer.
+    The same arguments give the same cases, and the same seeds at every noise. Scans that cannot be read, which are
+    reported, and those on which no copy can be seen are passed over, so there may be fewer. One scan is kept at a time.
     """
-    images = list(found.images)
+    images = found.images
     sigma = noise * float((found.model.maximum - found.model.minimum).max())
-    for row, image in enumerate(images):
+    for row in range(len(images)):
         count = crops * (row + 1) // len(images) - crops * row // len(images)
+        if count == 0:
+            continue
+        try:
+            image = images[row]
+        except InputError as error:
+            if report is not None:
+                report(str(error))
+            continue
         generator = np.random.default_rng([seed, zlib.crc32(image.name.encode())])
         rows, copies = _seeds(image, found.model, count, generator)
         for draw, (place, copy) in enumerate(zip(rows.tolist(), copies.tolist(), strict=True)):

@@ -47,6 +47,7 @@ class Truth(NamedTuple):
     T_camera_object: tuple[Float[np.ndarray, "i 4 4"], ...]  # of all copies in each case's scan
     copy: tuple[int, ...]
     visible: Float[np.ndarray, " c"]
+    problems: tuple[str, ...]  # what could not be read when the cases were drawn
 
 
 class Predictions(NamedTuple):
@@ -103,8 +104,8 @@ class Export:
         self._read(method, name, noise)
         return True
 
-    def write_truth(self, name: str, noise: float, cases: Sequence[Case]) -> None:
-        """Write the true poses of cases."""
+    def write_truth(self, name: str, noise: float, cases: Sequence[Case], problems: Sequence[str] = ()) -> None:
+        """Write the true poses of cases, and what could not be read when they were drawn."""
         counts = [len(case.T_camera_object) for case in cases]
         tensors = {
             "poses": np.concatenate([case.T_camera_object for case in cases]) if cases else np.zeros((0, 4, 4)),
@@ -112,7 +113,8 @@ class Export:
             "copy": np.array([case.copy for case in cases], dtype=np.int64),
             "visible": np.array([case.visible for case in cases], dtype=np.float64),
         }
-        self._write("cases", name, noise, tensors, {"names": json.dumps([case.name for case in cases])})
+        texts = {"names": [case.name for case in cases], "problems": list(problems)}
+        self._write("cases", name, noise, tensors, {key: json.dumps(value) for key, value in texts.items()})
 
     def truth(self, name: str, noise: float) -> Truth:
         """Read the true poses of cases. Raises InputError if they are not there."""
@@ -123,6 +125,7 @@ class Export:
             tuple(np.split(tensors["poses"], ends)) if len(tensors["counts"]) else (),
             tuple(tensors["copy"].tolist()),
             tensors["visible"],
+            tuple(json.loads(metadata["problems"])),
         )
 
     def write(self, method: str, name: str, noise: float, found: Predictions) -> None:
@@ -180,8 +183,9 @@ def export(
         known = folder.has("cases", found.name, noise)
         if not missing and known:
             continue
-        cases = list(draw_cases(found, crops, noise, seed))
-        folder.write_truth(found.name, noise, cases)
+        problems: list[str] = []
+        cases = list(draw_cases(found, crops, noise, seed, problems.append))
+        folder.write_truth(found.name, noise, cases, problems)
         refine = Refinement(found.model)
         for key, method in missing.items():
             bar.set_postfix_str(f"{found.name[:24]}, noise {noise:g}, {method.name}", refresh=True)

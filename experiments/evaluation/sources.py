@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
@@ -57,7 +57,7 @@ def bop_objects(folder: Path, split: str, report: Report, most_images: int | Non
         ObjectImages(
             names[object_id],
             replace(model, name=names[object_id]),
-            BopImages(dataset, model, object_id, tuple(_spread(keys[object_id], most_images)), report),
+            BopImages(dataset, model, object_id, tuple(_spread(keys[object_id], most_images))),
         )
         for object_id, model in models.items()
         if keys[object_id]
@@ -75,17 +75,13 @@ class BopImages:
     model: ObjectModel
     object_id: int
     keys: tuple[FrameKey, ...]
-    report: Report
 
-    def __iter__(self) -> Iterator[Image]:
-        for key in self.keys:
-            try:
-                frame = self.dataset.frame(*key, masks=True).with_visibility()
-                yield self._image(key, frame)
-            except InputError as error:
-                self.report(str(error))
+    def __len__(self) -> int:
+        return len(self.keys)
 
-    def _image(self, key: FrameKey, frame: BopFrame) -> Image:
+    def __getitem__(self, row: int, /) -> Image:
+        key = self.keys[row]
+        frame = self.dataset.frame(*key, masks=True).with_visibility()
         copies = [instance for instance in frame.instances or () if instance.object_id == self.object_id]
         points = measured_points(frame.depth, frame.camera)
         return Image(
@@ -106,16 +102,12 @@ class CloudImages:
     camera: Path | None
     unit: str  # of clouds, poses and sensor, as of the CAD file
     sensor: Float[np.ndarray, "3"] | None  # in the clouds' frame; the origin unless given
-    report: Report
 
-    def __iter__(self) -> Iterator[Image]:
-        for path, poses in self.files:
-            try:
-                yield self._image(path, poses)
-            except InputError as error:
-                self.report(str(error))
+    def __len__(self) -> int:
+        return len(self.files)
 
-    def _image(self, path: Path, poses: Float[np.ndarray, "i 4 4"]) -> Image:
+    def __getitem__(self, row: int, /) -> Image:
+        path, poses = self.files[row]
         scale = METRES[self.unit] / METRES[UNIT]
         scan = read_scan(path, self.unit, self.camera).in_unit(UNIT)
         view = view_of(scan, None if self.sensor is None else self.sensor * scale)
@@ -132,14 +124,13 @@ def cloud_objects(
     camera: Path | None,
     unit: str,
     sensor: Float[np.ndarray, "3"] | None,
-    report: Report,
     most_images: int | None = None,
 ) -> list[ObjectImages]:
     """Return the object of a folder of scans with poses; see `clouds`. Lengths are in `unit`, those of the CAD too."""
     files = scans_with_poses(folder, cad)
     path = cad or mesh_of(folder)
     model = load_object(path, unit, OBJECT).in_unit(UNIT)
-    images = CloudImages(model, tuple(_spread(files, most_images)), camera or camera_of(folder), unit, sensor, report)
+    images = CloudImages(model, tuple(_spread(files, most_images)), camera or camera_of(folder), unit, sensor)
     return [ObjectImages(path.stem, model, images)]
 
 

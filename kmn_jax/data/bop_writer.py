@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import math
 import os
@@ -92,16 +93,17 @@ def write_scene(
 def dataset_digest(folder: str | Path) -> str:
     """Return the SHA-256 over the names and contents of all files under a folder, of images over their pixels.
 
-    It does not depend on how a version of zlib compresses. Hidden files and folders, such as unfinished scenes, are
-    passed over.
+    It does not depend on how a version of zlib compresses; an image that is damaged counts as its bytes are. Hidden
+    files and folders, such as unfinished scenes, are passed over.
     """
     folder, digest = Path(folder), hashlib.sha256()
     names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     for name in (name for name in names if not any(part.startswith(".") for part in name.split("/"))):
         content = (folder / name).read_bytes()
         if name.endswith(".png"):
-            image = pixels(folder / name)
-            content = f"{image.shape} {image.dtype.str} ".encode() + image.tobytes()
+            with contextlib.suppress(InputError):
+                image = pixels(folder / name)
+                content = f"{image.shape} {image.dtype.str} ".encode() + image.tobytes()
         digest.update(f"{name} {len(content)}\n".encode() + content)
     return digest.hexdigest()
 
