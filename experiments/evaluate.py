@@ -8,6 +8,7 @@ refused. The report, Markdown and a page of HTML that needs no other file, is wr
 from __future__ import annotations
 
 import hashlib
+import json
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -20,22 +21,27 @@ import tyro
 from experiments.evaluation.cases import ObjectImages, limited
 from experiments.evaluation.configs import CONFIGS, OWN_NETWORKS, EvaluateConfig, find_config
 from experiments.evaluation.methods import ONE_RANSAC, Method, Ours, OursConfig, OwnNetworks
-from experiments.evaluation.predictions import Export, code_digest, export, library_versions
+from experiments.evaluation.predictions import Export, check_files, code_digest, export, library_versions
 from experiments.evaluation.refinement import SETTINGS
 from experiments.evaluation.report import Result, draw_pictures, write_report
 from experiments.evaluation.rivals import OverMatches, missing
 from experiments.evaluation.scores import cells_of
 from experiments.evaluation.sources import Report, bop_objects, cloud_objects
 from experiments.evaluation.tuned import RIVALS
-from experiments.test_sets import build_test_set
+from experiments.test_sets import SPLIT, build_test_set
 from kmn_jax.checks import InputError
 from kmn_jax.data.bop import dataset_digest
+from kmn_jax.data.bop_models import NAMES_FILE
 from kmn_jax.data.build import Source
-from kmn_jax.data.mesh_files import MESH_SUFFIXES
+from kmn_jax.data.mesh_files import MESH_SUFFIXES, read_file
 from kmn_jax.estimator.part import model_digest
+from kmn_jax.files import write_whole
 from kmn_jax.models import Model, load_model, released_file
 from kmn_jax.pose import RansacConfig
 from kmn_jax.report import environment, processor
+
+_CAD_RECORD = ".cad.json"  # of which files bins were made; hidden, so that digests pass over it
+_ELSEWHERE = ("name", "methods", "cad", "cad_names")  # fields that the rest of the recipe tells, or that decide nothing
 
 
 @dataclass(frozen=True)
@@ -68,7 +74,7 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
     problems: list[str] = []
     objects = _objects(config, partial(_note, problems))
     recipe = {
-        "config": {key: value for key, value in asdict(config).items() if key not in ("methods", "name")},
+        "config": {key: value for key, value in asdict(config).items() if key not in _ELSEWHERE},
         "data": _data_digest(config),
         "weights": model_digest(model),
         "code": code_digest(),
@@ -145,28 +151,51 @@ def _objects(config: EvaluateConfig, report: Report) -> list[ObjectImages]:
         place, images = config.sensor_place, config.images
         found = cloud_objects(config.folder, config.object, config.camera, config.units, place, images)
     else:
-        if config.cad is not None and not config.folder.exists():
+        if config.cad is not None:
             _make_bins(config.folder, config.cad, config.cad_names)
+        elif config.cad_names and not (config.folder / "camera.json").exists():  # which is written last
+            raise InputError(
+                f"{config.folder} holds no bins, or not all: give the folder of their CAD files with --cad"
+            )
         found = bop_objects(config.folder, config.split, report, config.images)
     found = limited(found, config.objects)
     if not found:
         raise InputError(f"none of the objects is named {', '.join(config.objects)}")
+    check_files([one.name for one in found], NAMES_FILE)
     return found
 
 
 def _make_bins(folder: Path, cad: Path, names: tuple[str, ...]) -> None:
-    """Make bins of the CAD files of a folder, as those of the test sets."""
+    """Make bins of the CAD files of a folder, as those of the test sets, but for those that are there already.
+
+    Raises InputError if those that are there are not known to be of the same files.
+    """
     paths = sorted(path for path in cad.glob("*") if path.suffix.lower() in MESH_SUFFIXES)
     chosen = [path for path in paths if not names or any(name in path.stem for name in names)]
     if not chosen:
         raise InputError(f"{cad} holds no CAD file{f' named like {names}' if names else ''}")
+    check_files([path.stem for path in chosen], str(cad))
+    digests = [[path.stem, hashlib.sha256(read_file(path)).hexdigest()] for path in chosen]
+    record = folder / _CAD_RECORD
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        known = json.loads(record.read_text(encoding="utf-8")) if record.exists() else None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{record} cannot be used ({error}): choose another --folder, or delete it") from None
+    if known != digests and (folder / SPLIT).exists():
+        raise InputError(
+            f"{folder} holds bins of other CAD files than those in {cad}, or does not say of which:"
+            " choose another --folder, or delete it"
+        )
+    write_whole(record, (json.dumps(digests, indent=1) + "\n").encode())
     build_test_set(folder, [Source(path.stem, "test", path) for path in chosen])
 
 
 def _data_digest(config: EvaluateConfig) -> str:
     """Return a digest of all that is read: a BOP dataset, or the files beside the clouds."""
     assert config.folder is not None
-    extra = b"".join(path.read_bytes() for path in (config.object, config.camera) if path is not None)
+    files = ((config.object, "a CAD file"), (config.camera, "a camera file"))
+    extra = b"".join(read_file(path, what) for path, what in files if path is not None)
     return hashlib.sha256(dataset_digest(config.folder).encode() + extra).hexdigest()
 
 

@@ -48,7 +48,7 @@ class EvaluateConfig:
     source: Source = "bop"
     folder: Path | None = None  # BOP dataset, or clouds with poses
     split: str = "test"  # of the BOP dataset
-    cad: Path | None = None  # folder of meshes, of which bins are made if `folder` does not exist
+    cad: Path | None = None  # folder of meshes, of which bins are made in `folder`
     cad_names: tuple[str, ...] = ()  # parts of the names of those to take; all unless given
     object: Path | None = None  # of clouds: the CAD file; the only one in the folder unless given
     camera: Path | None = None  # of depth images among clouds; camera.json in the folder unless given
@@ -66,6 +66,8 @@ class EvaluateConfig:
         """Refuse what cannot be evaluated."""
         if self.crops < 1 or (self.images is not None and self.images < 1):
             raise InputError(f"crops = {self.crops} and images = {self.images} must be 1 or more")
+        if self.seed < 0:
+            raise InputError(f"seed is {self.seed}, but must be 0 or more")
         if not self.noise or not all(0 <= level < 1 for level in self.noise):
             raise InputError(f"noise is {self.noise}, but must be shares of the object's longest side, 0 to 1")
         if not self.methods:

@@ -243,5 +243,15 @@ def _sources() -> Iterator[Path]:
         yield from (file for file in files if file.name not in _NOT_POSES)
 
 
+def check_files(names: Sequence[str], where: str) -> None:
+    """Raise InputError if predictions of two of these objects would be in the same files; `where` to rename them."""
+    taken: dict[str, str] = {}
+    for name in names:
+        if (slug := _slug(name)) in taken:
+            both = f"the objects {taken[slug]!r} and {name!r}"
+            raise InputError(f"{both} would have the same files of predictions: rename one of them in {where}")
+        taken[slug] = name
+
+
 def _slug(name: str) -> str:
     return "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in name)

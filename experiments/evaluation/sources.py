@@ -20,7 +20,7 @@ from kmn_jax.data.bop_crops import load_models
 from kmn_jax.data.bop_models import NAMES_FILE
 from kmn_jax.data.cad import ObjectConfig, ObjectModel, load_object
 from kmn_jax.data.foreground import foreground
-from kmn_jax.data.mesh_files import METRES
+from kmn_jax.data.mesh_files import METRES, read_file
 from kmn_jax.data.scan_files import Scan, read_scan
 from kmn_jax.data.scene import measured_points
 from kmn_jax.estimator.view import view_of
@@ -127,6 +127,9 @@ def cloud_objects(
     most_images: int | None = None,
 ) -> list[ObjectImages]:
     """Return the object of a folder of scans with poses; see `clouds`. Lengths are in `unit`, those of the CAD too."""
+    for given, what in ((cad, "a CAD file"), (camera, "a camera file")):
+        if given is not None:
+            read_file(given, what)
     files = scans_with_poses(folder, cad)
     path = cad or mesh_of(folder)
     model = load_object(path, unit, OBJECT).in_unit(UNIT)

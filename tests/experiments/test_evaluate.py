@@ -225,6 +225,7 @@ def test_networks_of_one_object_each_are_a_method(
         (["demo", "--objects", "none"], "none of the objects is named none"),
         (["demo", "--crops", "0"], "must be 1 or more"),
         (["demo", "--noise", "2"], "noise"),
+        (["demo", "--seed", "-1"], "seed is -1, but must be 0 or more"),
         (["demo", "--weights", "none"], "none"),
     ],
 )
