@@ -91,7 +91,9 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
     titles = {key: method.name for key, method in methods.items()}
     cells = cells_of(exported, {found.name: found.model for found in objects}, titles, config.noise)
     used = {**exported.recipe, "methods": {key: exported.recipe["methods"][key] for key in methods}}
-    result = Result(config, environment(), used, cells, skipped, tuple(problems), methods)
+    units = [(key, found.name, noise) for key in methods for found in objects for noise in config.noise]
+    commits = sorted({exported.made_at(*unit) for unit in units})
+    result = Result(config, environment(), used, cells, skipped, tuple(problems), methods, tuple(commits))
     return write_report(folder, result, draw_pictures(result, objects, exported))
 
 

@@ -24,6 +24,7 @@ from experiments.evaluation.methods import Method
 from experiments.evaluation.refinement import Refinement
 from kmn_jax.checks import InputError
 from kmn_jax.files import read_safetensors, write_whole
+from kmn_jax.report import commit
 
 _ROOT = Path(__file__).parents[2]
 _CODE = (
@@ -66,6 +67,7 @@ class Export:
 
     folder: Path
     recipe: Mapping[str, Any]
+    commit: str = "unknown"  # of the code that writes; not of the recipe, whose digest of the code is more exact
 
     @classmethod
     def open(cls, folder: Path, recipe: Mapping[str, Any], overwrite: bool) -> Export:
@@ -91,7 +93,7 @@ class Export:
             if not any(not name.startswith(_OF_METHOD) for name in stale):  # what other methods found stays
                 plain["methods"] = {**old.get("methods", {}), **plain.get("methods", {})}
         write_whole(file, (json.dumps(plain, indent=1) + "\n").encode())
-        return cls(folder, plain)
+        return cls(folder, plain, commit() or "unknown")
 
     def path(self, method: str, name: str, noise: float) -> Path:
         """Return the file of an object and noise."""
@@ -136,13 +138,18 @@ class Export:
         """Read what a method found. Raises InputError if it is not there."""
         return Predictions(**self._read(method, name, noise)[0])
 
+    def made_at(self, method: str, name: str, noise: float) -> str:
+        """Return the commit that a method's poses were made at."""
+        return self._read(method, name, noise)[1].get("commit", "unknown")
+
     def _write(
         self, method: str, name: str, noise: float, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]
     ) -> None:
         path = self.path(method, name, noise)
         path.parent.mkdir(parents=True, exist_ok=True)
         plain = {key: np.ascontiguousarray(value) for key, value in tensors.items()}
-        write_whole(path, save(plain, metadata={"format": _HEADER, "recipe": self._digest(method), **metadata}))
+        own = {"format": _HEADER, "recipe": self._digest(method), "commit": self.commit}
+        write_whole(path, save(plain, metadata={**own, **metadata}))
 
     def _read(self, method: str, name: str, noise: float) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         path = self.path(method, name, noise)

@@ -46,6 +46,7 @@ class Result:
     skipped: Mapping[str, str]  # why methods could not run
     problems: Sequence[str]  # what of the data was left out
     methods: Mapping[str, Method]  # that ran, by their keys
+    commits: Sequence[str]  # that poses were made at, before or now
 
 
 def write_report(folder: Path, result: Result, pictures: Mapping[str, bytes]) -> Path:
@@ -143,6 +144,7 @@ def _facts(result: Result) -> dict[str, str]:
     return {
         "Command": environment["command"],
         "Commit": str(environment["commit"]),
+        "Poses": f"made at {'commit' if len(result.commits) == 1 else 'commits'} {', '.join(result.commits)}",
         "Date": environment["date"],
         "Machine": f"{environment['processor']}, {environment['cores']} cores, {environment['platform']}",
         "Versions": versions,
@@ -222,7 +224,7 @@ def _scores(result: Result) -> dict[str, Any]:
         }
         for cell in result.cells
     ]
-    facts = {"environment": dict(result.environment), "recipe": dict(result.recipe)}
+    facts = {"environment": dict(result.environment), "recipe": dict(result.recipe), "poses": list(result.commits)}
     return {**facts, "skipped": dict(result.skipped), "left out": list(result.problems), "cells": cells}
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from experiments import ablate, evaluate, tune_rivals
+from experiments.evaluation import predictions
 from experiments.evaluation.cases import Case, ObjectImages, draw_cases
 from experiments.evaluation.configs import EvaluateConfig
 from experiments.evaluation.rivals import FastGlobal, Fpfh, Kiss, PointPairs, missing
@@ -110,9 +111,16 @@ def test_evaluating_twice_gives_the_same_numbers_and_a_report(
         assert "FPFH + RANSAC + ICP" in text
         assert "kiss: no_such_rival cannot be imported" in text
 
-    stamp = (tmp_path / "one" / "ours" / f"{GEAR}.noise0.safetensors").stat().st_mtime_ns
+    own, rivals = tmp_path / "one" / "ours" / f"{GEAR}.noise0.safetensors", tmp_path / "one" / "fpfh"
+    stamp = own.stat().st_mtime_ns
+    (before,) = json.loads((tmp_path / "one" / "scores.json").read_text())["poses"]
+    shutil.rmtree(rivals)
+    monkeypatch.setattr(predictions, "commit", lambda: "a1b2c3")
     assert evaluate.main(["demo", *options, "--output", str(tmp_path / "one")]) == 0
-    assert (tmp_path / "one" / "ours" / f"{GEAR}.noise0.safetensors").stat().st_mtime_ns == stamp  # not made anew
+    assert own.stat().st_mtime_ns == stamp  # not made anew
+    made_at = json.loads((tmp_path / "one" / "scores.json").read_text())["poses"]
+    assert made_at == sorted({"a1b2c3", before})
+    assert f"- Poses: made at commits {', '.join(made_at)}" in (tmp_path / "one" / "report.md").read_text()
     assert evaluate.main(["demo", *options, "--seed", "1", "--output", str(tmp_path / "one")]) == 2
     assert "differing: config" in capsys.readouterr().err
 
