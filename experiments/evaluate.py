@@ -14,14 +14,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from experiments.evaluation.cases import ObjectImages, limited
 from experiments.evaluation.configs import CONFIGS, OWN_NETWORKS, EvaluateConfig, find_config
 from experiments.evaluation.methods import ONE_RANSAC, Method, Ours, OursConfig, OwnNetworks
-from experiments.evaluation.predictions import Export, check_files, code_digest, export, library_versions
+from experiments.evaluation.predictions import Export, check_files, code_digest, export, library_versions, rivals_digest
 from experiments.evaluation.refinement import SETTINGS
 from experiments.evaluation.report import Result, draw_pictures, write_report
 from experiments.evaluation.rivals import OverMatches, missing
@@ -79,7 +79,7 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
         "weights": model_digest(model),
         "code": code_digest(),
         "versions": library_versions(),
-        "methods": {key: method.settings for key, method in methods.items()},
+        "methods": {key: _settings(method) for key, method in methods.items()},
         "refinement": {key: str(value) for key, value in SETTINGS.items()},
         "processor": processor(),
     }
@@ -95,6 +95,16 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
     commits = sorted({exported.made_at(*unit) for unit in units})
     result = Result(config, environment(), used, cells, skipped, tuple(problems), methods, tuple(commits))
     return write_report(folder, result, draw_pictures(result, objects, exported))
+
+
+def _settings(method: Method) -> dict[str, Any]:
+    """Return all that decides a method's poses, but for what decides those of all methods."""
+    return {**method.settings, **({"rivals' code": rivals_digest()} if uses_rivals(method) else {})}
+
+
+def uses_rivals(method: Method) -> bool:
+    """Tell whether the code of rivals decides a method's poses."""
+    return method.search is not None if isinstance(method, Ours) else not isinstance(method, OwnNetworks)
 
 
 def _methods(config: EvaluateConfig, model: Model, networks: Path | None) -> tuple[dict[str, Method], dict[str, str]]:

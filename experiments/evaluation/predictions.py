@@ -32,10 +32,11 @@ _CODE = (
     *(f"kmn_jax/estimator/{name}.py" for name in ("candidates", "crop_pose", "search", "part", "view")),
 )
 _LIBRARIES = ("jax", "jaxlib", "numpy", "open3d", "opencv-contrib-python-headless", "kiss-matcher")
-# Of experiments/evaluation; what configs and tuned settings say is in the recipe.
+_RIVALS = "rivals.py"
+# Of experiments/evaluation; configs, tuned settings and the code of rivals are in the recipe, for those they concern.
 _NOT_POSES = (
     *("scores.py", "report.py", "chosen.py", "plots.py", "pictures.py", "published.py"),
-    *("configs.py", "tuned.py"),
+    *("configs.py", "tuned.py", _RIVALS),
 )
 _HEADER = "kmn_jax evaluation 1"
 _OF_METHOD = "method "
@@ -223,12 +224,17 @@ def _timed(solve: Callable[[Case], Any], refine: Refinement, case: Case) -> tupl
 
 
 def code_digest() -> str:
-    """Return the SHA-256 of all code that decides poses."""
+    """Return the SHA-256 of all code that decides poses, but for that of rivals."""
     digest = hashlib.sha256()
-    for path in _sources():
+    for path in sources():
         digest.update(path.relative_to(_ROOT).as_posix().encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def rivals_digest() -> str:
+    """Return the SHA-256 of the code of rivals, which makes the poses of those alone stale."""
+    return hashlib.sha256((Path(__file__).parent / _RIVALS).read_bytes()).hexdigest()
 
 
 def library_versions() -> dict[str, str | None]:
@@ -243,7 +249,8 @@ def library_versions() -> dict[str, str | None]:
     return {name: found(name) for name in _LIBRARIES}
 
 
-def _sources() -> Iterator[Path]:
+def sources() -> Iterator[Path]:
+    """Yield the files of all code that decides poses, but for that of rivals."""
     for name in _CODE:
         place = _ROOT / name
         files = [place] if place.is_file() else sorted(place.rglob("*.py"))

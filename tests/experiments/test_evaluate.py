@@ -15,7 +15,8 @@ from experiments import ablate, evaluate, tune_rivals
 from experiments.evaluation import predictions
 from experiments.evaluation.cases import Case, ObjectImages, draw_cases
 from experiments.evaluation.configs import EvaluateConfig
-from experiments.evaluation.rivals import FastGlobal, Fpfh, Kiss, PointPairs, missing
+from experiments.evaluation.methods import Ours, OwnNetworks
+from experiments.evaluation.rivals import FastGlobal, Fpfh, Kiss, OverMatches, PointPairs, missing
 from experiments.evaluation.sources import bop_objects, cloud_objects
 from experiments.evaluation.tuned import RIVALS
 from kmn_jax.checks import InputError
@@ -121,6 +122,11 @@ def test_evaluating_twice_gives_the_same_numbers_and_a_report(
     made_at = json.loads((tmp_path / "one" / "scores.json").read_text())["poses"]
     assert made_at == sorted({"a1b2c3", before})
     assert f"- Poses: made at commits {', '.join(made_at)}" in (tmp_path / "one" / "report.md").read_text()
+    capsys.readouterr()
+
+    monkeypatch.setattr(evaluate, "rivals_digest", lambda: "other code")
+    assert evaluate.main(["demo", *options, "--output", str(tmp_path / "one")]) == 2
+    assert "(differing: method fpfh)" in capsys.readouterr().err  # ours is not
     assert evaluate.main(["demo", *options, "--seed", "1", "--output", str(tmp_path / "one")]) == 2
     assert "differing: config" in capsys.readouterr().err
 
@@ -180,6 +186,17 @@ def test_clouds_with_poses_are_evaluated_from_their_sensor(tmp_path: Path, gear:
         assert np.linalg.norm(found.model.points - local, axis=1).min() < 0.05 * found.model.diameter
 
 
+def test_the_code_of_rivals_makes_rivals_stale_alone() -> None:
+    used = evaluate.uses_rivals
+    model = load_model(released_file("small"))
+    assert not used(Ours("ours", model))
+    assert not used(OwnNetworks("own", {}))
+    assert used(Ours("Open3D's RANSAC", model, search=OverMatches()))
+    assert all(used(kind()) for kind in (Fpfh, FastGlobal, Kiss, PointPairs))
+    assert "rivals.py" not in {path.name for path in predictions.sources()}
+    assert {"cases.py", "methods.py", "icp.py"} <= {path.name for path in predictions.sources()}
+
+
 def test_an_ablation_changes_one_choice_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = {"10 keypoints": ablate.VARIANTS["10 keypoints"], "256 points": ablate.VARIANTS["256 points"]}
     monkeypatch.setattr(ablate, "VARIANTS", chosen)
@@ -190,6 +207,7 @@ def test_an_ablation_changes_one_choice_at_a_time(tmp_path: Path, monkeypatch: p
         f"{name}{refined}" for name in ("kmn_jax", *chosen) for refined in ("", " + ICP")
     }
     settings = content["recipe"]["methods"]
+    assert "rivals' code" not in settings["ours"]
     assert settings["10_keypoints"]["num_keypoints"] == 10
     assert settings["ours"]["num_keypoints"] is None
 
@@ -202,6 +220,7 @@ def test_rivals_are_tuned_by_settings_side_by_side(tmp_path: Path, monkeypatch: 
     assert set(settings) == {f"{name}{how}" for name in ("fpfh_0.05", "kiss_0.03") for how in ("", "_smoothed")}
     assert settings["fpfh_0.05_smoothed"]["features"]["smooth"]
     assert settings["fpfh_0.05"]["features"]["voxel"] == 0.05
+    assert settings["fpfh_0.05"]["rivals' code"] == predictions.rivals_digest()
 
 
 def test_networks_of_one_object_each_are_a_method(
