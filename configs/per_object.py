@@ -3,8 +3,11 @@
 What the published comparison's networks trained for each object stand for: it shows what zero-shot costs.
 
 per_object
-    Command:   python -m experiments.build_data per-object --cad PART.stl --folder outputs/packs/PART
+    Command:   python -m experiments.build_data per-object --folder outputs/packs/PART
+                   --cad outputs/test_sets/industrial/models/obj_00000N.ply
                python -m experiments.train per_object --pack outputs/packs/PART --folder runs/PART
+    Data:      the PLY file of the test set, not the CAD file that it was made of: keypoints are its first points, and
+               an evaluation refuses networks of another file.
     Hardware:  2 CPU cores. Not yet run.
     Expected:  not yet known.
 """
