@@ -20,7 +20,7 @@ from experiments.evaluation.cases import Case
 from kmn_jax.checks import InputError
 from kmn_jax.data.cad import ObjectModel
 from kmn_jax.estimator.candidates import arrays_of
-from kmn_jax.estimator.crop_pose import CropPoseConfig, Said, crop_pose, matches_of, said_of_draws
+from kmn_jax.estimator.crop_pose import CropPoseConfig, Said, crop_for_draws, crop_pose, matches_of, said_of_draws
 from kmn_jax.estimator.part import Part, make_part, model_digest
 from kmn_jax.estimator.result import CropPrediction
 from kmn_jax.estimator.search import PartArrays, SceneArrays
@@ -163,9 +163,8 @@ def _said(
     config: CropPoseConfig,
 ) -> tuple[Said, jax.Array]:
     """Return what the network says of the draws that `crop_pose` makes with the same key, and the crop's seed."""
-    crop_key, _ = jax.random.split(key)
-    crop, said = said_of_draws(nnx.merge(graphdef, parameters), part, scene, crop_key, num_points, config)
-    return said, crop.seed
+    crop = crop_for_draws(part, scene, key, num_points, config)
+    return said_of_draws(nnx.merge(graphdef, parameters), part, crop, config), crop.seed
 
 
 _matches = jax.jit(matches_of, static_argnames="config")

@@ -13,23 +13,25 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
 from kmn_jax.data.crops import Crop, CropConfig, crop_around
 from kmn_jax.data.smoothing import SmoothConfig
 from kmn_jax.estimator.search import PartArrays, SceneArrays, as_visible
 from kmn_jax.models import KeyMatchNet
 from kmn_jax.pose import (
+    IcpConfig,
     MatchConfig,
     Matches,
     PoseResult,
     RansacConfig,
     SurfaceConfig,
     find_matches,
+    icp,
     ransac_modes,
     surface_agreement,
 )
-from kmn_jax.typing import PRNGKey, Scalar
+from kmn_jax.typing import Pose, PRNGKey, Scalar
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class CropPoseConfig:
     surface_points: int = 128  # on the object
     smooth: SmoothConfig | None = field(default_factory=SmoothConfig)
     normal_points: int = 4096  # of the crop, from which normals are estimated
+    icp: IcpConfig | None = None  # refines the pose on the points of its draw
 
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
@@ -89,17 +92,16 @@ def drawn_crop(
     return crop_around(key, as_visible(scene), jnp.int32(0), jnp.bool_(True), *nowhere, diameter, crops)
 
 
-def said_of_draws(
-    network: KeyMatchNet,
-    part: PartArrays,
-    scene: SceneArrays,
-    key: PRNGKey,
-    num_points: int,
-    config: CropPoseConfig,
-) -> tuple[Crop, Said]:
-    """Return a crop around a scene's first point, and what the network says of draws of it; fields of it (d, ...)."""
+def crop_for_draws(part: PartArrays, scene: SceneArrays, key: PRNGKey, num_points: int, config: CropPoseConfig) -> Crop:
+    """Return the crop around a scene's first point that holds all draws, as `crop_pose` takes it with the same key."""
+    count = config.num_draws * (num_points - 1) + 1
+    return drawn_crop(scene, part.diameter, _crop_key(key), count, config.normal_points, config.smooth)
+
+
+def said_of_draws(network: KeyMatchNet, part: PartArrays, crop: Crop, config: CropPoseConfig) -> Said:
+    """Return what the network says of each draw of a crop's points; its fields are (d, ...)."""
     count = config.num_draws
-    crop = drawn_crop(scene, part.diameter, key, count * (num_points - 1) + 1, config.normal_points, config.smooth)
+    num_points = (crop.points.shape[0] - 1) // count + 1
 
     def one(draw: Int[Array, ""]) -> Said:
         # Each has the seed, and every so many-th of the others: also where there are fewer than asked for.
@@ -108,7 +110,7 @@ def said_of_draws(
         features = network.encode_scene(jnp.concatenate([points, normals], axis=1), part.diameter, mask)
         return Said(points, normals, mask, *network.match(features, part.features, mask))
 
-    return crop, jax.lax.map(one, jnp.arange(count, dtype=jnp.int32))
+    return jax.lax.map(one, jnp.arange(count, dtype=jnp.int32))
 
 
 def matches_of(said: Said, part: PartArrays, config: MatchConfig) -> Matches:
@@ -127,6 +129,49 @@ def matches_of(said: Said, part: PartArrays, config: MatchConfig) -> Matches:
     )
 
 
+def poses_of_draws(
+    said: Said, valid: Bool[Array, ""], part: PartArrays, key: PRNGKey, config: CropPoseConfig
+) -> PoseResult:
+    """Return the poses that the matches of each draw agree on, (d * h, ...), relative to the crop's seed."""
+
+    def one(item: tuple[Said, Key[Array, ""]]) -> PoseResult:
+        draw, key = item
+        matches = matches_of(draw, part, config.matches)
+        return ransac_modes(key, matches._replace(mask=matches.mask & valid), config.num_modes, config.ransac)
+
+    keys = jax.random.split(_pose_key(key), config.num_draws)
+    found: PoseResult = jax.tree.map(_flat, jax.lax.map(one, (said, keys)))
+    return found
+
+
+def surface_scores(
+    poses: PoseResult, said: Said, seed: Float[Array, "3"], part: PartArrays, config: CropPoseConfig
+) -> Float[Array, " p"]:
+    """Return how well the points of all draws confirm each pose; minus infinity where there is none."""
+    surface, normals = part.points[: config.surface_points], part.normals[: config.surface_points]
+    points, point_normals, mask, on_object = map(_flat, (said.points, said.normals, said.mask, said.on_object))
+
+    def one(pose: PoseResult) -> Scalar:
+        def compared() -> Scalar:
+            seen = surface_agreement(
+                pose.T_scene_object,
+                surface,
+                normals,
+                points,
+                point_normals,
+                mask,
+                on_object,
+                -seed,
+                part.diameter,
+                config.surface,
+            )
+            return seen.score + pose.score
+
+        return jax.lax.cond(pose.converged, compared, lambda: jnp.float32(-jnp.inf))
+
+    return jax.lax.map(one, poses)
+
+
 @partial(jax.jit, static_argnames=("graphdef", "config", "num_points"))
 def crop_pose(
     graphdef: nnx.GraphDef,
@@ -142,40 +187,42 @@ def crop_pose(
     What is farther from that point than a diameter is not used. `num_points` of a draw are as many as the network was
     made for. Inlier counts are those of the matches of the draw that the pose is from, its mask that draw's.
     """
-    crop_key, pose_key = jax.random.split(key)
-    crop, said = said_of_draws(nnx.merge(graphdef, parameters), part, scene, crop_key, num_points, config)
-    surface, normals = part.points[: config.surface_points], part.normals[: config.surface_points]
-
-    def poses_of(item: tuple[Said, Key[Array, ""]]) -> PoseResult:
-        draw, key = item
-        matches = matches_of(draw, part, config.matches)
-        enough = matches._replace(mask=matches.mask & crop.valid)
-        return ransac_modes(key, enough, config.num_modes, config.ransac)
-
-    keys = jax.random.split(pose_key, config.num_draws)
-    poses, points, point_normals, mask, on_object = jax.tree.map(
-        lambda leaf: leaf.reshape(-1, *leaf.shape[2:]),
-        (jax.lax.map(poses_of, (said, keys)), said.points, said.normals, said.mask, said.on_object),
-    )
-
-    def score_of(pose: PoseResult) -> Scalar:
-        def compared() -> Scalar:
-            seen = surface_agreement(
-                pose.T_scene_object,
-                surface,
-                normals,
-                points,
-                point_normals,
-                mask,
-                on_object,
-                -crop.seed,
-                part.diameter,
-                config.surface,
-            )
-            return seen.score + pose.score
-
-        return jax.lax.cond(pose.converged, compared, lambda: jnp.float32(-jnp.inf))
-
-    best = jnp.argmax(jax.lax.map(score_of, poses))
+    crop = crop_for_draws(part, scene, key, num_points, config)
+    said = said_of_draws(nnx.merge(graphdef, parameters), part, crop, config)
+    poses = poses_of_draws(said, crop.valid, part, key, config)
+    best = jnp.argmax(surface_scores(poses, said, crop.seed, part, config))
     found: PoseResult = jax.tree.map(lambda leaf: leaf[best], poses)
+    if config.icp is not None:
+        draw: Said = jax.tree.map(lambda leaf: leaf[best // config.num_modes], said)
+        found = found._replace(T_scene_object=refined(found, draw, part, config.icp))
     return found._replace(T_scene_object=found.T_scene_object.at[:3, 3].add(jnp.where(found.converged, crop.seed, 0)))
+
+
+def refined(found: PoseResult, draw: Said, part: PartArrays, config: IcpConfig) -> Pose:
+    """Return a pose moved onto the points of a draw; one that is none stays as it is."""
+
+    def moved() -> Pose:
+        fine = icp(
+            part.points,
+            draw.points,
+            found.T_scene_object,
+            part.diameter,
+            scene_normals=draw.normals,
+            scene_mask=draw.mask,
+            config=config,
+        )
+        return fine.T_scene_object
+
+    return jax.lax.cond(found.converged, moved, lambda: found.T_scene_object)
+
+
+def _crop_key(key: PRNGKey) -> PRNGKey:
+    return jax.random.split(key)[0]
+
+
+def _pose_key(key: PRNGKey) -> PRNGKey:
+    return jax.random.split(key)[1]
+
+
+def _flat(leaf: Shaped[Array, "d n ..."]) -> Shaped[Array, "m ..."]:
+    return leaf.reshape(-1, *leaf.shape[2:])

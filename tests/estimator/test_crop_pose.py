@@ -16,7 +16,7 @@ from experiments.evaluation.cases import Case, ObjectImages, draw_cases
 from experiments.evaluation.methods import padded
 from experiments.evaluation.sources import bop_objects
 from kmn_jax.estimator.candidates import arrays_of
-from kmn_jax.estimator.crop_pose import CropPoseConfig, crop_pose, matches_of, said_of_draws
+from kmn_jax.estimator.crop_pose import CropPoseConfig, crop_for_draws, crop_pose, matches_of, said_of_draws
 from kmn_jax.estimator.part import make_part
 from kmn_jax.estimator.search import PartArrays, SceneArrays
 from kmn_jax.models import Model, load_model, released_file
@@ -79,9 +79,10 @@ def test_metres_and_millimetres_give_one_pose(model: Model, part: PartArrays, ca
 def test_one_draw_and_one_pose_are_the_published_search(model: Model, part: PartArrays, cases: list[Case]) -> None:
     plain, scene, key = replace(CONFIG, num_draws=1, num_modes=1), padded(cases[0].points), jax.random.key(0)
     found = solve(model, part, scene, plain)
-    crop_key, pose_key = jax.random.split(key)
+    _, pose_key = jax.random.split(key)
     network = nnx.merge(model.graphdef, model.parameters)
-    crop, said = jax.jit(said_of_draws, static_argnums=(0, 4, 5))(network, part, scene, crop_key, 512, plain)
+    crop = jax.jit(crop_for_draws, static_argnums=(3, 4))(part, scene, key, 512, plain)
+    said = jax.jit(said_of_draws, static_argnums=(0, 3))(network, part, crop, plain)
     first = jax.tree.map(lambda leaf: leaf[0], said)
     matches = matches_of(first, part, plain.matches)
     alone = ransac(jax.random.split(pose_key, 1)[0], matches, plain.ransac)
