@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from kmn_jax.geometry import inverse, transform_points
+from kmn_jax.geometry.knn import first_smallest
 from kmn_jax.typing import Mask, Normals, Points, Pose, Scalar
 
 
@@ -73,23 +74,21 @@ def surface_agreement(
     faces = (normals * sight).sum(axis=1) < -config.facing
     reach = config.tolerance * object_diameter
 
-    offsets = _squares(surface, scene_points)
-    alike = jnp.matmul(normals, scene_normals.T, precision=highest) > config.min_cosine
-    confirmed = ((offsets <= reach**2) & alike & mask[None]).any(axis=1)
+    # As sums over coordinates and minima down columns, CPUs vectorise all of it and store no matrix.
+    alike = (_cosines(scene_normals, normals) > config.min_cosine) & mask[:, None]
+    confirmed = jnp.where(alike, _squares(scene_points, surface), jnp.inf).min(axis=0) <= reach**2
 
     # Of the measured lines of sight the one that passes nearest: does it end behind the surface?
     lines, ends = _directions(scene_points, camera)
-    beside = jnp.where(mask[None], _squares(sight, lines), jnp.inf)
-    nearest = jnp.argmin(beside, axis=1)
-    passes = jnp.take_along_axis(beside, nearest[:, None], axis=1)[:, 0] * away**2 <= reach**2
+    nearest, beside = first_smallest(jnp.where(mask[:, None], _squares(lines, sight), jnp.inf))
+    passes = beside * away**2 <= reach**2
     through = passes & (ends[nearest] - away > reach) & ~confirmed
 
     # From the points' side: in the object's frame, so that the same function of pairs serves.
     local = transform_points(inverse(T_scene_object), scene_points)
     local_normals = jnp.matmul(scene_normals, T_scene_object[:3, :3], precision=highest)
-    back = _squares(local, object_points) <= reach**2
-    same = jnp.matmul(local_normals, object_normals.T, precision=highest) > config.min_cosine
-    explained = (back & same).any(axis=1)
+    same = _cosines(object_normals, local_normals) > config.min_cosine
+    explained = jnp.where(same, _squares(object_points, local), jnp.inf).min(axis=0) <= reach**2
     taken = mask & on_object
     return SurfaceAgreement(_share(confirmed, faces), _share(through, faces), _share(explained, taken))
 
@@ -98,6 +97,12 @@ def _squares(points: Float[Array, "a 3"], others: Float[Array, "b 3"]) -> Float[
     """Return squared distances, by differences: of unit vectors that nearly agree, products would leave no digit."""
     x, y, z = (points[:, None, axis] - others[None, :, axis] for axis in range(3))
     return x * x + y * y + z * z
+
+
+def _cosines(normals: Float[Array, "a 3"], others: Float[Array, "b 3"]) -> Float[Array, "a b"]:
+    """Return the cosines between unit vectors."""
+    x, y, z = (normals[:, None, axis] * others[None, :, axis] for axis in range(3))
+    return x + y + z
 
 
 def _directions(
