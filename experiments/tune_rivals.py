@@ -11,49 +11,70 @@ from pathlib import Path
 from typing import Any
 
 from experiments.evaluate import Options, compare, released_or_own, run
-from experiments.evaluation.methods import Method
-from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kiss, PointPairs, missing
+from experiments.evaluation.methods import ONE_RANSAC, Method, Ours, OursConfig
+from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kiss, OverMatches, PointPairs, missing
 from experiments.evaluation.tuned import RIVALS
+from kmn_jax.models import Model
 
 # Of each rival, voxels without smoothing and with it; finer where the coarse end of a first look was the worse one.
 _VOXELS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "fpfh": ((0.03, 0.04, 0.05, 0.065), (0.03, 0.04, 0.05, 0.065)),
-    "fgr": ((0.015, 0.02, 0.025, 0.03), (0.025,)),
     "kiss": ((0.015, 0.025), (0.01, 0.015, 0.02)),
 }
-_PAIRS = tuple((sampling, share) for sampling in (0.1, 0.07) for share in (0.2, 0.05))  # of PPF
+_TUPLES = ((0.025, 1000, 0.95), (0.05, 3000, 0.9))  # of FGR: gate, tuples, their scale; the first are its authors'
+_PAIRS = ((0.1, 0.05, 0.05), (0.07, 0.05, 0.05), (0.07, 0.1, 0.05))  # of PPF: model, scene, share of reference points
+_GATES = (0.06, 0.1, 0.15)  # of Open3D's RANSAC over our matches; the first is the published one
 
 
-def methods_of(name: str) -> dict[str, Method]:
+def methods_of(name: str, model: Model) -> dict[str, Method]:
     """Return a rival with each of the settings."""
     methods: list[Any] = []
-    for smooth in (False, True):
+    if name == "ours_open3d":
+        one = OursConfig(ONE_RANSAC)
+        methods = [Ours(f"Open3D RANSAC {gate:g}", model, one, OverMatches(gate=gate)) for gate in _GATES]
+    for smooth in (False, True) if name in RIVALS else ():
         of_smooth = ", smoothed" if smooth else ""
         if name == "ppf":
-            features = replace(PointPairs().features, smooth=smooth)
             methods += [
-                PointPairs(f"PPF {sampling:g} {share:g}{of_smooth}", sampling, share, features)
-                for sampling, share in _PAIRS
+                PointPairs(
+                    f"PPF {sampling:g} {voxel:g} {share:g}{of_smooth}",
+                    sampling,
+                    share,
+                    FeatureSettings(voxel=voxel, smooth=smooth),
+                )
+                for sampling, voxel, share in _PAIRS
             ]
-            continue
-        for voxel in _VOXELS[name][smooth]:
-            title = f"{name} {voxel:g}{of_smooth}"
-            features = FeatureSettings(voxel=voxel, smooth=smooth)
-            if name == "kiss":
-                finer = replace(features, voxel=voxel / 1.5) if smooth else None
-                methods.append(Kiss(title, voxel, finer))
-            else:
-                methods.append((Fpfh if name == "fpfh" else FastGlobal)(title, features))
+        elif name == "fgr":
+            features = [FeatureSettings(voxel=voxel) for voxel in (0.02, 0.03)]
+            methods = [
+                FastGlobal(f"FGR {own.voxel:g} {gate:g} {tuples}", own, True, gate, tuples, scale)
+                for own in features
+                for gate, tuples, scale in _TUPLES
+            ]
+            methods.append(FastGlobal("FGR 0.02, gate fixed", features[0], decrease_mu=False))
+        else:
+            methods += [_of_voxel(name, voxel, smooth, of_smooth) for voxel in _VOXELS[name][smooth]]
     return {method.name.replace(" ", "_").replace(",", ""): method for method in methods}
+
+
+def _of_voxel(name: str, voxel: float, smooth: bool, of_smooth: str) -> Fpfh | Kiss:
+    title, features = f"{name} {voxel:g}{of_smooth}", FeatureSettings(voxel=voxel, smooth=smooth)
+    if name == "fpfh":
+        return Fpfh(title, features)
+    return Kiss(title, voxel, replace(features, voxel=voxel / 1.5) if smooth else None)
 
 
 def tune(options: Options) -> Path:
     """Compare all settings of the rivals that are among the config's methods; return the path of the report's page."""
-    names = [name for name in options.config.methods if name in RIVALS]
-    skipped = {name: reason for name in names if (reason := missing(RIVALS[name][0])) is not None}
-    methods = {key: method for name in names if name not in skipped for key, method in methods_of(name).items()}
+    model = released_or_own(options.config.weights)
+    needed = {**{name: module for name, (module, _) in RIVALS.items()}, "ours_open3d": "open3d"}
+    names = [name for name in options.config.methods if name in needed]
+    skipped = {name: reason for name in names if (reason := missing(needed[name])) is not None}
+    methods = {key: method for name in names if name not in skipped for key, method in methods_of(name, model).items()}
+    if "ours" in options.config.methods:  # beside them
+        methods["ours"] = Ours("kmn_jax", model)
     folder = options.output or Path("outputs") / "tuning" / options.config.name
-    return compare(replace(options, output=folder), released_or_own(options.config.weights), methods, skipped)
+    return compare(replace(options, output=folder), model, methods, skipped)
 
 
 def main(arguments: list[str] | None = None) -> int:

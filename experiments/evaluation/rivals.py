@@ -91,11 +91,17 @@ class Fpfh:
 
 @dataclass(frozen=True)
 class FastGlobal:
-    """FPFH features, Fast Global Registration (Open3D)."""
+    """FPFH features, Fast Global Registration (Open3D), with the options that its authors ship.
+
+    Open3D's own defaults leave graduated non-convexity out (`decrease_mu`), and with it the gate.
+    """
 
     name: str = "FPFH + FGR"
     features: FeatureSettings = FeatureSettings()
-    gate_voxels: float = 0.5
+    decrease_mu: bool = True
+    gate: float = 0.025  # of the larger cloud's radius, by which both are scaled
+    tuples: int = 1000
+    tuple_scale: float = 0.95
 
     @property
     def settings(self) -> Mapping[str, Any]:
@@ -105,8 +111,12 @@ class FastGlobal:
     def prepare(self, model: ObjectModel) -> Solver:
         """Return a solver that describes each crop anew."""
         registration = quiet_open3d().pipelines.registration
-        gate = self.gate_voxels * self.features.voxel * model.diameter
-        option = registration.FastGlobalRegistrationOption(maximum_correspondence_distance=gate)
+        option = registration.FastGlobalRegistrationOption(
+            decrease_mu=self.decrease_mu,
+            maximum_correspondence_distance=self.gate,
+            maximum_tuple_count=self.tuples,
+            tuple_scale=self.tuple_scale,
+        )
 
         def registered(source: Described, target: Described) -> Any:
             return registration.registration_fgr_based_on_feature_matching(
@@ -120,13 +130,14 @@ class FastGlobal:
 class PointPairs:
     """Point pair features and voting (OpenCV's ppf_match_3d); the best pose is taken.
 
-    A finer sampling than this one, as the package's 0.05, takes minutes to hash a part with large flat faces.
+    The package thins a scan by shares of its bounding box; here it is thinned to voxels before, and only what is
+    nearer than half of that is merged.
     """
 
     name: str = "PPF"
     sampling: float = 0.07  # of model and votes' distances
     scene_share: float = 0.2  # of the scene's points are reference points
-    features: FeatureSettings = FeatureSettings()
+    features: FeatureSettings = FeatureSettings(voxel=0.05)
 
     @property
     def settings(self) -> Mapping[str, Any]:
@@ -136,15 +147,17 @@ class PointPairs:
     def prepare(self, model: ObjectModel) -> Solver:
         """Hash the model's pairs, once for all noises and settings of the search; solving samples and votes."""
         detector = _hashed(model, self.sampling)
+        compile_smoothing(self.features)
 
         def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
             target = thinned_cloud(case.points, None, self.features, model.diameter)
             # Relative to the seed: floats of millimetres far from the sensor would lose digits.
             offsets = np.asarray(target.points) - case.points[0]
-            cloud = np.concatenate([offsets, np.asarray(target.normals)], axis=1).astype(np.float32)
-            if len(cloud) < _LEAST_POINTS:
+            if len(offsets) < _LEAST_POINTS:
                 return None
-            found = detector.match(cloud, self.scene_share, self.sampling)
+            cloud = np.concatenate([offsets, np.asarray(target.normals)], axis=1).astype(np.float32)
+            merged = self.features.voxel * model.diameter / 2
+            found = detector.match(cloud, self.scene_share, merged / float(np.ptp(offsets, axis=0).max()))
             if not len(found):
                 return None
             pose = np.array(found[0].pose, dtype=np.float64)
@@ -197,6 +210,8 @@ class Kiss:
             points = case.points.astype(np.float64)
             if self.features is not None:
                 points = np.asarray(thinned_cloud(points, None, self.features, model.diameter).points)
+            if len(points) < _LEAST_POINTS:
+                return None
             target = ((points - case.points[0]) / model.diameter).astype(np.float32)
             found = matcher.estimate(source, target)
             pose = np.eye(4)
@@ -302,7 +317,8 @@ def _smoothed(thinned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "p 3"
     real = np.asarray(mask) & known
     cloud = open3d.geometry.PointCloud(_vectors(moved[real] + origin))
     cloud.normals = _vectors(normals[real])
-    cloud.orient_normals_towards_camera_location(np.zeros(3))
+    if real.any():
+        cloud.orient_normals_towards_camera_location(np.zeros(3))
     return cloud
 
 
