@@ -217,7 +217,9 @@ def test_rivals_are_tuned_by_settings_side_by_side(tmp_path: Path, monkeypatch: 
     options = ["demo", "--objects", GEAR, "--images", "1", "--crops", "2", "--output", str(tmp_path / "out")]
     assert tune_rivals.main(options) == 0
     settings = json.loads((tmp_path / "out" / "scores.json").read_text())["recipe"]["methods"]
-    assert set(settings) == {f"{name}{how}" for name in ("fpfh_0.05", "kiss_0.03") for how in ("", "_smoothed")}
+    rivals = {f"{name}{how}" for name in ("fpfh_0.05", "kiss_0.03") for how in ("", "_smoothed")}
+    assert set(settings) == {*rivals, "ours"}
+    assert "rivals' code" not in settings["ours"]
     assert settings["fpfh_0.05_smoothed"]["features"]["smooth"]
     assert settings["fpfh_0.05"]["features"]["voxel"] == 0.05
     assert settings["fpfh_0.05"]["rivals' code"] == predictions.rivals_digest()
