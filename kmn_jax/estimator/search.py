@@ -194,7 +194,8 @@ def spread_rows(mask: Bool[Array, " n"], count: int) -> tuple[Int[Array, " c"], 
     total = mask.sum(dtype=jnp.int32)
     order = jnp.nonzero(mask, size=mask.shape[0], fill_value=0)[0]
     place = jnp.arange(count, dtype=jnp.int32)
-    return order[jnp.where(total > count, place * total // count, place)], place < total
+    spread = place * (total // count) + place * (total % count) // count  # place * total may be beyond int32
+    return order[jnp.where(total > count, spread, place)], place < total
 
 
 def each(function: Callable[..., _Result], real: Bool[Array, " s"], *items: Any) -> _Result:

@@ -18,6 +18,7 @@ from kmn_jax.estimator.search import (
     crop_features,
     search,
     seed_keys,
+    spread_rows,
     spread_seeds,
 )
 from kmn_jax.estimator.verify import VerifyConfig, depth_buffer
@@ -132,3 +133,15 @@ def test_padding_changes_nothing(model: Model, part: PartArrays) -> None:
     one, other = (run(model, part, where._replace(points=points), [5, 9, 60]) for points in (where.points, rubbish))
     for name, value in one.items():
         np.testing.assert_array_equal(value, other[name])
+
+
+@pytest.mark.parametrize(("total", "count"), [(5, 8), (700, 512), (307_200, 32_768), (1_900_000, 40_000)])
+def test_rows_are_spread_over_large_masks_too(total: int, count: int) -> None:
+    """Products of places and totals are beyond 32 bits."""
+    mask = np.ones(total + 7, dtype=bool)
+    mask[3:10] = False
+    rows, real = spread_rows(jnp.asarray(mask), count)
+    order = np.flatnonzero(mask)
+    assert real.sum() == min(total, count)
+    places = np.arange(count, dtype=np.int64) * total // count if total > count else np.arange(total)
+    np.testing.assert_array_equal(np.asarray(rows)[np.asarray(real)], order[places])
