@@ -32,8 +32,8 @@ format: $(READY) ## format and apply the safe lint fixes
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-bench: $(BENCH_READY) ## run the short benchmarks
-	$(BIN)/python -m benchmarks.short
+bench: $(READY) ## whether anything is slower than it was, by ratios
+	$(BIN)/python -m benchmarks.gate
 
 bench-env: $(BENCH_READY) ## add PyTorch, for the benchmarks and the tests marked torch
 

@@ -1,4 +1,4 @@
-"""The network against its dense forms in JAX and PyTorch: time, agreement, memory, stages and their floor.
+"""The network against its dense forms in JAX and PyTorch: time, agreement, memory.
 
 python -m benchmarks.network [--batches 1 4 16 64] [--repeats 15] [--json FILE]
 """
@@ -6,7 +6,6 @@ python -m benchmarks.network [--batches 1 4 16 64] [--repeats 15] [--json FILE]
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,8 +18,7 @@ from flax import nnx
 
 from benchmarks.memory import peak_of_each
 from benchmarks.network_cases import Case, dense_jax_forward, make_case, torch_forward
-from benchmarks.stages import measure_stages
-from benchmarks.timing import Compiled, compile_for, measure_ceilings, time_in_turn
+from benchmarks.timing import Compiled, compile_for, time_in_turn
 from kmn_jax.models.layers import Compute
 from kmn_jax.report import print_table, write_json
 
@@ -29,7 +27,6 @@ def main(
     batches: tuple[int, ...] = (1, 4, 16, 64),
     repeats: int = 15,
     dense_up_to: int = 4,
-    stages: bool = True,
     memory: bool = True,
     json: Path | None = None,
 ) -> None:
@@ -39,7 +36,6 @@ def main(
         batches: crops at once.
         repeats: timed rounds; every round runs every rival.
         dense_up_to: largest batch at which the dense forms take part (they need 0.5 GB a crop).
-        stages: time each stage of the network beside its arithmetic floor.
         memory: peak memory of one forward, each rival in a process of its own (Linux CPU only).
         json: where results go.
     """
@@ -50,14 +46,6 @@ def main(
     if memory and jax.default_backend() == "cpu":
         results["memory"] = memory_rows()
         print_table("peak memory of one forward beyond weights and inputs, batch 1", results["memory"])
-    if stages:
-        ceilings = measure_ceilings()
-        results |= {"ceilings": asdict(ceilings), "stages": measure_stages(make_case(1), ceilings, repeats)}
-        print_table(
-            f"stages at batch 1; ceilings {ceilings.matmul_flops / 1e9:.0f} GFLOP/s float32,"
-            f" {ceilings.copy_bytes / 1e9:.0f} GB/s",
-            results["stages"],
-        )
     write_json(json, results)
 
 

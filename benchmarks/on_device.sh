@@ -6,7 +6,7 @@
 set -euo pipefail
 wheels=$1 output=$2
 shift 2
-subjects=${*:-network knn pose scenes training}
+subjects=${*:-roofline crops network training scaling knn pose scenes}
 cd "$(dirname "$0")/.."
 site=$(mktemp -d)
 python3 -m pip install --quiet --no-index --no-deps --no-compile --no-cache-dir --target "$site" "$wheels"/*.whl
@@ -14,7 +14,7 @@ export PYTHONPATH=$site PYTHONUNBUFFERED=1 XLA_PYTHON_CLIENT_PREALLOCATE=false
 python3 -c 'import jax; print(jax.__version__, jax.devices())'
 declare -A arguments=(
   [network]="--batches 1 4 16 64 --dense-up-to 4 --no-memory" [knn]="" [pose]="--draws 40"
-  [scenes]="--batches 1 64 256" [training]=""
+  [scenes]="--batches 1 64 256" [training]="" [roofline]="" [scaling]="" [crops]="--batches 1 16 64 256"
 )
 for subject in $subjects; do
   # shellcheck disable=SC2086

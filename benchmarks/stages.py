@@ -1,89 +1,164 @@
-"""Each stage of the scene branch and the pair head on its own, beside the time its arithmetic must take."""
+"""The stages of a forward pass, of a crop's way to its pose and of training, each as a call of its own."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from benchmarks import training, work
 from benchmarks.network_cases import Case
-from benchmarks.timing import Ceilings, compile_for, time_in_turn
+from benchmarks.timing import compile_for
+from benchmarks.work import Work
+from configs import find_config
+from experiments.evaluation.cases import Case as PoseCase
+from experiments.evaluation.cases import draw_cases
+from experiments.evaluation.methods import padded
+from experiments.evaluation.sources import bop_objects
+from kmn_jax.checks import InputError
+from kmn_jax.data.cad import ObjectModel
+from kmn_jax.estimator.candidates import arrays_of
+from kmn_jax.estimator.crop_pose import (
+    CropPoseConfig,
+    Said,
+    crop_for_draws,
+    crop_pose,
+    poses_of_draws,
+    refined,
+    said_of_draws,
+    surface_scores,
+)
+from kmn_jax.estimator.part import make_part
 from kmn_jax.geometry.knn import k_nearest
+from kmn_jax.models import load_pretrained
+from kmn_jax.pose import IcpConfig
 
-N, K, NEIGHBORS, FLOAT = 2048, 20, 20, 4
+_SMALL_SET = Path("experiments/assets/small_test_set")
+REFINED = CropPoseConfig(icp=IcpConfig(iterations=20))
 
 
-def measure_stages(case: Case, ceilings: Ceilings, repeats: int) -> list[dict[str, Any]]:
-    """Return time, share of their sum, FLOP, least bytes, floor and gap of each stage at batch 1."""
-    model = case.model
-    xyz, x1 = case.crops[0][:, :3], _normal(0, N, 64)
-    graph = jax.jit(lambda x: k_nearest(x, x, NEIGHBORS))(x1)
-    local, scene, part = _normal(1, N, 192), _normal(2, N, 512), _normal(3, K, 128)
+class Stage(NamedTuple):
+    """A call that is compiled and has its arguments, and what it has to do."""
 
-    def stage(function: Callable[..., Any], *arguments: jax.Array) -> Callable[[], Any]:
+    call: Callable[[], Any]
+    work: Work
+
+
+def small_case() -> tuple[ObjectModel, PoseCase]:
+    """Return a crop of the small test set, and its object."""
+    objects = bop_objects(_SMALL_SET, "test", _refuse, most_images=1)[0]
+    return objects.model, next(iter(draw_cases(objects, 1, 0.01)))
+
+
+def network_stages(case: Case) -> dict[str, Stage]:
+    """Return the stages of the published network at batch 1, on what the stage before it would give in size."""
+    model, config = case.model, case.model.config
+    points, width = config.num_scene_points, config.edge_width
+    xyz, x1 = case.crops[0][:, :3], _normal(0, points, width)
+    graph = jax.jit(lambda x: k_nearest(x, x, config.num_neighbors))(x1)
+    local, scene = _normal(1, points, 3 * width), _normal(2, points, config.scene_width)
+    part = _normal(3, config.num_keypoints, config.object_width)
+
+    def of_network(function: Callable[..., Any], *arguments: jax.Array) -> Callable[[], Any]:
         ready = compile_for(lambda p, *a: function(nnx.merge(model.graphdef, p), *a), model.parameters, *arguments)
         return lambda: ready.function(model.parameters, *arguments)
 
-    def knn(width: int) -> tuple[float, float]:
-        return 2.0 * N * N * width, FLOAT * (N * width + N * NEIGHBORS)
+    def nearest(x: jax.Array) -> Callable[[], Any]:
+        return of_network(lambda _, x: k_nearest(x, x, config.num_neighbors), x)
 
-    edges, selected = N * NEIGHBORS, FLOAT * N * NEIGHBORS
-    # (call, FLOP, least bytes: inputs and outputs once, the N x k x 64 tensors of two-layer blocks once each way)
-    cases: dict[str, tuple[Callable[[], Any], float, float]] = {
-        "kNN on coordinates": (stage(lambda _, x: k_nearest(x, x, NEIGHBORS), xyz), *knn(3)),
-        "kNN on features, first": (stage(lambda _, x: k_nearest(x, x, NEIGHBORS), x1), *knn(64)),
-        "kNN on features, second": (stage(lambda _, x: k_nearest(x, x, NEIGHBORS), local[:, :64]), *knn(64)),
-        "EdgeConv 1": (
-            stage(lambda net, x, g: net.scene.edge1(x, g, "float32"), case.crops[0], graph),
-            2.0 * (2 * N * 6 * 64 + edges * 64 * 64),
-            FLOAT * (N * 70 + 2 * edges * 64) + selected,
-        ),
-        "EdgeConv 2": (
-            stage(lambda net, x, g: net.scene.edge2(x, g, "float32"), x1, graph),
-            2.0 * (2 * N * 64 * 64 + edges * 64 * 64),
-            FLOAT * (N * 128 + 2 * edges * 64) + selected,
-        ),
-        "EdgeConv 3": (
-            stage(lambda net, x, g: net.scene.edge3(x, g, "float32"), x1, graph),
-            2.0 * 2 * N * 64 * 64 + 2.0 * edges * 64,
-            FLOAT * N * 128 + selected,
-        ),
-        "global and output layers": (
-            stage(lambda net, x: net.scene._with_global(x, "float32", None), local),
-            2.0 * (N * 192 * 1024 + N * 192 * 512 + 1024 * 512),
-            FLOAT * (N * (192 + 512) + 192 * 1024 + 1216 * 512),
-        ),
-        "pair head": (
-            stage(lambda net, s, o: net.match(s, o), scene, part),
-            2.0 * (N * 512 * 256 + N * 256 * 256 + N * 256 * 2) + 3.0 * N * K * 256,
-            FLOAT * (N * (512 + 2 + K) + 1024 * 256),
-        ),
+    calls = {
+        "kNN on coordinates": nearest(xyz),
+        "EdgeConv 1": of_network(lambda net, x, g: net.scene.edge1(x, g, "float32"), case.crops[0], graph),
+        "kNN on features, first": nearest(x1),
+        "EdgeConv 2": of_network(lambda net, x, g: net.scene.edge2(x, g, "float32"), x1, graph),
+        "kNN on features, second": nearest(local[:, :width]),
+        "EdgeConv 3": of_network(lambda net, x, g: net.scene.edge3(x, g, "float32"), x1, graph),
+        "global and output layers": of_network(lambda net, x: net.scene._with_global(x, "float32", None), local),
+        "pair head": of_network(lambda net, s, o: net.match(s, o), scene, part),
     }
-    times = time_in_turn({name: call for name, (call, _, _) in cases.items()}, repeats)
-    total = sum(steady.median_ms for steady in times.values())
-    rows = []
-    for name, (_, flops, transferred) in cases.items():
-        floor = ceilings.floor_ms(flops, transferred)
-        rows.append(_row(name, times[name].median_ms, total, flops, transferred, floor))
-    flops, transferred, floor = (sum(row[key] for row in rows) for key in ("GFLOP", "MB", "floor ms"))
-    rows.append(_row("sum of the stages", total, total, 1e9 * flops, 1e6 * transferred, floor))
-    return rows
+    return _joined(calls, work.scene_stages(config, points))
 
 
-def _row(name: str, ms: float, total: float, flops: float, transferred: float, floor: float) -> dict[str, Any]:
-    return {
-        "stage": name,
-        "ms": ms,
-        "share": ms / total,
-        "GFLOP": flops / 1e9,
-        "MB": transferred / 1e6,
-        "floor ms": floor,
-        "x floor": ms / floor,
+def pose_stages(config: CropPoseConfig = REFINED) -> dict[str, Stage]:
+    """Return the stages from a scan to the refined pose by the released network, on a crop of the small test set."""
+    model = load_pretrained("small")
+    found, case = small_case()
+    part, scene = arrays_of(model, make_part(found, model)), padded(case.points)
+    key, sizes = jax.random.key(0), model.config
+    count, draws = sizes.num_scene_points, config.num_draws
+    if config.icp is None:
+        raise InputError("the stages of a crop end with its refinement: give icp")
+    icp = config.icp
+
+    crop_call = compile_for(lambda p, s, k: crop_for_draws(p, s, k, count, config), part, scene, key).function
+    crop = crop_call(part, scene, key)
+
+    def network(parameters: nnx.State, part: Any, crop: Any) -> Said:
+        return said_of_draws(nnx.merge(model.graphdef, parameters), part, crop, config)
+
+    said_call = compile_for(network, model.parameters, part, crop).function
+    said = said_call(model.parameters, part, crop)
+    poses_call = compile_for(
+        lambda s, v, p, k: poses_of_draws(s, v, p, k, config), said, crop.valid, part, key
+    ).function
+    poses = poses_call(said, crop.valid, part, key)
+    scores_call = compile_for(lambda f, s, c, p: surface_scores(f, s, c, p, config), poses, said, crop.seed, part)
+    best = int(jnp.argmax(scores_call.function(poses, said, crop.seed, part)))
+    pose, draw = (jax.tree.map(lambda leaf, row=row: leaf[row], of) for of, row in ((poses, best), (said, 0)))
+    icp_call = compile_for(lambda f, s, p: refined(f, s, p, icp), pose, draw, part).function
+    calls = {
+        "crop and normals": lambda: crop_call(part, scene, key),
+        "network on all draws": lambda: said_call(model.parameters, part, crop),
+        "matches and RANSAC of all draws": lambda: poses_call(said, crop.valid, part, key),
+        "choice by the surface": lambda: scores_call.function(poses, said, crop.seed, part),
+        "ICP": lambda: icp_call(pose, draw, part),
+        "crop to refined pose, one call": lambda: crop_pose(*model, part, scene, key, count, config),
     }
+    kept = draws * (count - 1) + 1
+    pairs = min(config.matches.capacity, count * sizes.num_keypoints)
+    search = work.matches(count, sizes.num_keypoints, config.matches) + work.ransac(
+        pairs, config.num_modes, config.ransac
+    )
+    of_stage = {
+        "crop and normals": work.drawn_crop(len(scene.points), max(kept, config.normal_points), kept),
+        "network on all draws": work.total(work.scene_stages(sizes, count)).times(draws),
+        "matches and RANSAC of all draws": search.times(draws),
+        "choice by the surface": work.surface_scores(draws * config.num_modes, config.surface_points, draws * count),
+        "ICP": work.icp(len(part.points), count, icp),
+    }
+    return _joined(calls, of_stage | {"crop to refined pose, one call": work.total(of_stage)})
+
+
+def training_stages(names: tuple[str, ...], on_cpu: bool) -> dict[str, Stage]:
+    """Return a step of each named training config, its samples included, and the making of these alone."""
+    stages: dict[str, Stage] = {}
+    for name in names:
+        config = training.of_batch(find_config(name), 8 if on_cpu else 128, on_cpu)
+        config = replace(config, network=replace(config.network, compute="float32")) if on_cpu else config
+        step, data, _ = training.steps(config, 1)
+        pipeline = config.pipeline
+        counted = work.training_step(config.network, pipeline.batch_size, pipeline.crops_per_object)
+        stages[f"{name}: a step of {pipeline.batch_size} with its data"] = Stage(step, counted)
+        crops = config.examples.crops
+        drawn = work.drawn_crop(crops.num_drawn, crops.num_drawn, crops.num_points)
+        stages[f"{name}: its data alone"] = Stage(data, drawn.times(pipeline.batch_size))
+    return stages
+
+
+def _joined(calls: Mapping[str, Callable[[], Any]], of_stage: Mapping[str, Work]) -> dict[str, Stage]:
+    if set(calls) != set(of_stage):
+        raise ValueError(f"stages and their work differ: {set(calls) ^ set(of_stage)}")
+    return {name: Stage(call, of_stage[name]) for name, call in calls.items()}
 
 
 def _normal(seed: int, *shape: int) -> jax.Array:
     return jax.random.normal(jax.random.key(seed), shape, dtype=jnp.float32)
+
+
+def _refuse(problem: str) -> None:
+    raise InputError(problem)

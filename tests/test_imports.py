@@ -29,8 +29,12 @@ RANKS = {
 # Pairs of neighbours that the ranks alone would allow: the pose solver takes arrays, not models.
 FORBIDDEN = {("kmn_jax.pose", "kmn_jax.models"), ("benchmarks", "experiments"), ("experiments", "benchmarks")}
 OUTER_RANKS = {"configs": 10, "experiments": 11, "benchmarks": 11, "tests": 12}
-# The dense reference networks live with the tests, bins of known poses with the experiments: benchmarks need both.
-ALLOWED = {("benchmarks", "tests.reference"), ("benchmarks", "experiments.bins")}
+# The dense reference networks live with the tests, bins and crops of known poses and rivals with the experiments.
+ALLOWED = {
+    ("benchmarks", "tests.reference"),
+    ("benchmarks", "experiments.bins"),
+    ("benchmarks", "experiments.evaluation"),
+}
 
 # flax.nnx itself loads optax, so optax cannot be on this list.
 HEAVY = ("open3d", "trimesh", "mujoco", "grain", "viser", "torch", "orbax")

@@ -1,0 +1,152 @@
+"""From points to refined poses by the released network: crops a second at growing batches, and a whole bin in one call.
+
+python -m benchmarks.crops [--batches 1 4 16 64] [--folder DATASET] [--json FILE]
+
+A crop's stages are one compiled call, a bin's too: depth image in, ranked poses out. Beside a bin's call stands the
+search in rounds of `PoseEstimator.detect`, which refines on more points and compares turned forms of each pose.
+"""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from benchmarks.stages import REFINED, small_case
+from benchmarks.timing import compile_for, time_in_turn
+from experiments.bins import THRESHOLD, BinImage, bin_images
+from experiments.evaluation.methods import padded
+from kmn_jax.data.splat import intrinsics
+from kmn_jax.estimator import PoseEstimator
+from kmn_jax.estimator.bin_poses import BinPosesConfig, bin_part, bin_poses
+from kmn_jax.estimator.candidates import arrays_of
+from kmn_jax.estimator.crop_pose import crop_pose
+from kmn_jax.estimator.evidence import Sight
+from kmn_jax.estimator.part import make_part
+from kmn_jax.models import Model
+from kmn_jax.report import print_table, write_json
+
+_LEAST_VISIBLE = 0.3
+
+
+def main(
+    batches: tuple[int, ...] = (1, 4, 16),
+    folder: Path = Path("experiments/assets/small_test_set"),
+    every: int = 1,
+    seeds: int = 32,
+    repeats: int = 9,
+    json: Path | None = None,
+) -> None:
+    """Run both tables.
+
+    Args:
+        batches: crops at once.
+        folder: dataset in BOP format, with a bin in each image.
+        every: every so many images of it.
+        seeds: crops that a bin's call searches.
+        repeats: timed rounds.
+        json: where results go.
+    """
+    estimator = PoseEstimator.from_pretrained()
+    crops = [crop_row(estimator.model, batch, repeats) for batch in batches]
+    print_table("crops to refined poses, `small`", crops)
+    config = BinPosesConfig(num_seeds=seeds)
+    images = bin_images(folder, "test", estimator.model, every)
+    bins = [bin_row(estimator, image, config, repeats) for image in images]
+    print_table("whole bins", bins)
+    totals = {key: sum(row[key] for row in bins) for key in ("visible", *_counted("call"), *_counted("rounds"))}
+    print_table("all bins: poses, right ones, and visible copies that were found", [totals])
+    write_json(json, {"crops": crops, "bins": bins, "totals": totals})
+
+
+def crop_row(model: Model, batch: int, repeats: int) -> dict[str, Any]:
+    """Time the same crop, many times at once, each with draws of its own."""
+    found, case = small_case()
+    part, scene = arrays_of(model, make_part(found, model)), padded(case.points)
+    count = model.config.num_scene_points
+    keys = jax.random.split(jax.random.key(0), batch)
+    scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (batch, *leaf.shape)), scene)
+
+    def solve(parameters: Any, part: Any, scenes: Any, keys: jax.Array) -> Any:
+        def one(item: Any) -> Any:
+            scene, key = item
+            return crop_pose(model.graphdef, parameters, part, scene, key, count, REFINED)
+
+        # CPUs have no use for a batch: one crop fills the cores.
+        on_cpu = jax.default_backend() == "cpu"
+        return jax.lax.map(one, (scenes, keys)) if on_cpu else jax.vmap(lambda s, k: one((s, k)))(scenes, keys)
+
+    ready = compile_for(solve, model.parameters, part, scenes, keys)
+    call = partial(ready.function, model.parameters, part, scenes, keys)
+    steady = time_in_turn({"crops": call}, repeats)["crops"]
+    return {
+        "batch": batch,
+        "ms": steady.median_ms,
+        "min ms": steady.minimum_ms,
+        "crops/s": 1e3 * batch / steady.median_ms,
+        "compile s": ready.trace_s + ready.lower_s + ready.compile_s,
+        "temporary MB": ready.temporary_bytes / 1e6,
+        "converged": f"{int(call().converged.sum())} of {batch}",
+    }
+
+
+def bin_row(estimator: PoseEstimator, image: BinImage, config: BinPosesConfig, repeats: int) -> dict[str, Any]:
+    """Time one call, and the search in rounds, on the same image; count what each finds."""
+    model, view = estimator.model, image.scene.view
+    part = bin_part(model, image.part, estimator.probabilities.found, config)
+    sight = Sight(jnp.asarray(view.depth), intrinsics(view.camera))
+    inside, key = jnp.asarray(_foreground(image)), jax.random.key(0)
+    call = partial(bin_poses, *model, part, sight, inside, key, num_points=model.config.num_scene_points, config=config)
+    found = jax.device_get(call())
+    with jax.transfer_guard("disallow"):
+        times = time_in_turn({"call": call}, repeats)["call"]
+    poses = found.T_camera_object[found.mask & (found.probability >= estimator.config.accepted)]
+    image.scene.features.clear()
+    estimator.detect(image.part, image.scene)
+    image.scene.features.clear()
+    start = time.perf_counter()
+    detected = estimator.detect(image.part, image.scene)
+    seconds = time.perf_counter() - start
+    likely = [pose.T_scene_object for pose in detected.poses if pose.probability >= estimator.config.accepted]
+    return {
+        "part": image.part.name,
+        "copies": len(image.truth),
+        "visible": int((image.visible >= _LEAST_VISIBLE).sum()),
+        "call ms": times.median_ms,
+        **_tally("call", image, poses),
+        "rounds ms": 1e3 * seconds,
+        **_tally("rounds", image, np.array(likely, dtype=np.float32).reshape(-1, 4, 4)),
+    }
+
+
+def _counted(of: str) -> tuple[str, str, str]:
+    return f"{of} poses", f"{of} right", f"{of} found"
+
+
+def _tally(of: str, image: BinImage, poses: np.ndarray) -> dict[str, int]:
+    """Count poses, right ones, and copies that can be seen and have a right one."""
+    if not len(poses):
+        return dict.fromkeys(_counted(of), 0)
+    right = image.errors(poses) < THRESHOLD
+    counts = len(poses), right.any(axis=1).sum(), (right.any(axis=0) & (image.visible >= _LEAST_VISIBLE)).sum()
+    return dict(zip(_counted(of), map(int, counts), strict=True))
+
+
+def _foreground(image: BinImage) -> np.ndarray:
+    """Return the pixels whose points lie inside of the bin, as far as the scene kept them."""
+    view, camera = image.scene.view, image.scene.view.camera
+    x, y, z = image.scene.points[image.scene.foreground].T
+    flags = np.zeros(view.depth.shape, dtype=bool)
+    row, column = np.rint(y / z * camera.fy + camera.cy), np.rint(x / z * camera.fx + camera.cx)
+    flags[row.astype(int), column.astype(int)] = True
+    return flags
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,170 @@
+"""Whether anything has become slower: ratios of ours over plain forms in the same run, beside a committed baseline.
+
+python -m benchmarks.gate [--update] [--repeats 9] [--json FILE]
+
+Ratios, as milliseconds of a busy or another machine say nothing; loose, as ratios vary there too. `--update` writes the
+baseline anew, on a machine with nothing else to do.
+"""
+
+from __future__ import annotations
+
+import json as json_format
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import tyro
+from flax import nnx
+
+from benchmarks.network_cases import Case, dense_jax_forward, make_case
+from benchmarks.stages import REFINED, small_case
+from benchmarks.timing import compile_for, time_in_turn
+from experiments.evaluation.methods import padded
+from experiments.evaluation.tuned import RIVALS
+from kmn_jax.checks import InputError
+from kmn_jax.estimator.candidates import arrays_of
+from kmn_jax.estimator.crop_pose import crop_pose
+from kmn_jax.estimator.part import make_part
+from kmn_jax.geometry.knn import k_nearest, squared_distances
+from kmn_jax.models import load_pretrained
+from kmn_jax.models.normalization import released_object, released_scene
+from kmn_jax.report import print_table, write_json
+from tests.reference import dense_jax
+
+BASELINE = Path(__file__).with_name("baseline.json")
+LEAST = 0.6  # of the baseline's ratio: below, something has become slower
+_TRAINED_POINTS = 512  # of the gradient: the dense one needs gigabytes for more
+
+
+class Pair(NamedTuple):
+    """Two calls with the same result: ours, and the plain form that it is measured against."""
+
+    ours: Callable[[], Any]
+    plain: Callable[[], Any]
+
+
+def main(update: bool = False, repeats: int = 9, json: Path | None = None) -> int:
+    """Compare, and return 1 if a ratio has fallen too far.
+
+    Args:
+        update: write the baseline rather than compare with it.
+        repeats: timed rounds of each pair.
+        json: where the ratios go.
+    """
+    case = make_case(1)
+    pairs = {
+        "network, cached object, over dense JAX": network_pair(case),
+        "gradient of the network over dense JAX": gradient_pair(case),
+        "pair head over dense JAX": head_pair(case),
+        "20 nearest of 2048 coordinates over one top_k": neighbor_pair(3),
+        "20 nearest of 2048 features over one top_k": neighbor_pair(64),
+        "crop to refined pose over FPFH and RANSAC": pose_pair(),
+    }
+    ratios = {}
+    for name, pair in pairs.items():
+        times = time_in_turn(pair._asdict(), repeats)
+        ratios[name] = times["plain"].median_ms / times["ours"].median_ms
+    if update:
+        write_json(BASELINE, {"ratios": ratios})
+    rows, slower = compared(ratios, json_format.loads(BASELINE.read_text(encoding="utf-8"))["ratios"])
+    print_table("how many times faster ours is", rows)
+    write_json(json, {"ratios": ratios})
+    for name in slower:
+        print(f"slower than it was: {name}", file=sys.stderr)
+    return 1 if slower else 0
+
+
+def compared(ratios: dict[str, float], baseline: dict[str, float]) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return a row for each ratio, and the names of those that have fallen too far."""
+    if set(ratios) != set(baseline):
+        raise InputError(f"the baseline holds other ratios than were measured: {sorted(set(ratios) ^ set(baseline))}")
+    rows = [
+        {"pair": name, "ratio": ratio, "baseline": baseline[name], "least": LEAST * baseline[name]}
+        for name, ratio in ratios.items()
+    ]
+    return rows, [name for name, ratio in ratios.items() if ratio < LEAST * baseline[name]]
+
+
+def network_pair(case: Case) -> Pair:
+    """The scene branch and the pair head, beside all branches: the dense form caches nothing."""
+    graphdef, length = case.model.graphdef, jnp.float32(1)
+
+    def cached(parameters: nnx.State, crop: jax.Array, part: jax.Array) -> Any:
+        network = nnx.merge(graphdef, parameters)
+        return network.match(network.encode_scene(crop, length), part)
+
+    part = nnx.merge(graphdef, case.parameters).encode_object(case.clouds[0], case.keypoint_indices, length)
+    return Pair(
+        _ready(cached, case.parameters, case.crops[0], part),
+        _ready(dense_jax_forward, case),
+    )
+
+
+def gradient_pair(case: Case) -> Pair:
+    """The gradient of the sum of squared logits of a smaller crop."""
+    graphdef, length = case.model.graphdef, jnp.float32(1)
+    clouds = case.crops[0, :_TRAINED_POINTS], case.clouds[0, :_TRAINED_POINTS]
+    keypoints = jnp.arange(20) * (_TRAINED_POINTS // 20)
+
+    def ours(parameters: nnx.State, crop: jax.Array, cloud: jax.Array) -> jax.Array:
+        network = nnx.merge(graphdef, parameters)
+        part = network.encode_object(cloud, keypoints, length)
+        return _sum_of_squares(network.match(network.encode_scene(crop, length), part))
+
+    def plain(parameters: Any, crop: jax.Array, cloud: jax.Array) -> jax.Array:
+        crop, cloud = released_scene(crop, None), released_object(cloud)
+        scene = dense_jax.encode_scene(crop, parameters)
+        part = dense_jax.encode_object(cloud, keypoints, parameters)
+        return _sum_of_squares(dense_jax.match(scene, part, parameters))
+
+    return Pair(
+        _ready(jax.grad(ours), case.parameters, *clouds),
+        _ready(jax.grad(plain), nnx.to_pure_dict(case.parameters), *clouds),
+    )
+
+
+def head_pair(case: Case) -> Pair:
+    """The pair head on drawn features."""
+    scene = jax.random.normal(jax.random.key(0), (2048, 512))
+    part = jax.random.normal(jax.random.key(1), (20, 128))
+    graphdef = case.model.graphdef
+    return Pair(
+        _ready(lambda p, s, o: nnx.merge(graphdef, p).match(s, o), case.parameters, scene, part),
+        _ready(dense_jax.match, scene, part, nnx.to_pure_dict(case.parameters)),
+    )
+
+
+def neighbor_pair(width: int) -> Pair:
+    """Exact neighbours of drawn points."""
+    x = jax.random.normal(jax.random.key(0), (2048, width))
+    return Pair(
+        _ready(lambda x: k_nearest(x, x, 20), x), _ready(lambda x: jax.lax.top_k(-squared_distances(x, x), 20)[1], x)
+    )
+
+
+def pose_pair() -> Pair:
+    """The released network from a crop to the refined pose, beside Open3D's features and RANSAC without refinement."""
+    model = load_pretrained("small")
+    found, case = small_case()
+    arrays = arrays_of(model, make_part(found, model))
+    scene, key = padded(case.points), jax.random.key(0)
+    count = model.config.num_scene_points
+    fpfh = RIVALS["fpfh"][1]().prepare(found)
+    return Pair(lambda: crop_pose(*model, arrays, scene, key, count, REFINED), lambda: fpfh(case))
+
+
+def _ready(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+    return partial(compile_for(function, *arguments).function, *arguments)
+
+
+def _sum_of_squares(outputs: tuple[jax.Array, jax.Array]) -> jax.Array:
+    segmentation, logits = outputs
+    return (segmentation**2).sum() + (logits**2).sum()
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main))

@@ -1,0 +1,85 @@
+"""Every stage beside the time that its arithmetic or its memory must take, here and on an H200.
+
+python -m benchmarks.roofline [--repeats 15] [--json FILE]
+
+Floors here come from a matrix product and a copy measured in the same run; those of an H200 from the same two measured
+on one (a bfloat16 product and a copy) and, for float32 outside of matrix units, the vendor's figure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import jax
+import tyro
+
+from benchmarks.network_cases import make_case
+from benchmarks.stages import Stage, network_stages, pose_stages, training_stages
+from benchmarks.timing import Ceilings, measure_ceilings, time_in_turn
+from benchmarks.work import Work
+from kmn_jax.report import print_table, write_json
+
+# Measured on such a machine: 8192 x 8192 bfloat16 products of random data, and device-to-device copies. The first, of
+# float32 without matrix units, is the vendor's.
+H200 = Ceilings(matmul_flops=67e12, matmul_bfloat16_flops=788e12, copy_bytes=4.3e12)
+
+
+def main(repeats: int = 15, training: tuple[str, ...] = ("small", "base"), json: Path | None = None) -> None:
+    """Print three tables.
+
+    Args:
+        repeats: timed rounds of each stage.
+        training: configs of which a training step is timed.
+        json: where results go.
+    """
+    ceilings = measure_ceilings()
+    print(
+        f"ceilings here: {ceilings.matmul_flops / 1e9:.0f} GFLOP/s in float32,"
+        f" {ceilings.matmul_bfloat16_flops / 1e9:.0f} in bfloat16, {ceilings.copy_bytes / 1e9:.0f} GB/s"
+    )
+    results: dict[str, Any] = {"ceilings": asdict(ceilings), "H200": asdict(H200)}
+    tables = {
+        "network": ("network with cached object features, N = 2048, batch 1", network_stages(make_case(1)), True),
+        "pose": ("`small`, from a scan to the refined pose of one crop", pose_stages(), False),
+        "training": ("training", training_stages(training, jax.default_backend() == "cpu"), False),
+    }
+    for key, (title, stages, summed) in tables.items():
+        results[key] = roofline_rows(stages, ceilings, repeats, summed)
+        print_table(title, results[key])
+    write_json(json, results)
+
+
+def roofline_rows(stages: Mapping[str, Stage], ceilings: Ceilings, repeats: int, summed: bool) -> list[dict[str, Any]]:
+    """Time stages in turn; the last row is their sum if asked for."""
+    times = time_in_turn({name: stage.call for name, stage in stages.items()}, repeats)
+    rows = [_row(name, times[name].median_ms, stage.work, ceilings) for name, stage in stages.items()]
+    if summed:
+        works = [stage.work for stage in stages.values()]
+        total = sum(works[1:], start=works[0])
+        row = _row("sum of the stages", sum(row["ms"] for row in rows), total, ceilings)
+        for column in ("floor ms", "H200 floor us"):  # one after the other, each at its own limit
+            row[column] = sum(row[column] for row in rows)
+        rows.append(row | {"x floor": row["ms"] / row["floor ms"], "bound": None})
+    return rows
+
+
+def _row(name: str, ms: float, work: Work, ceilings: Ceilings) -> dict[str, Any]:
+    floor = work.floor_ms(ceilings)
+    return {
+        "stage": name,
+        "GFLOP": work.flops / 1e9,
+        "MB": work.moved / 1e6,
+        "FLOP/byte": work.intensity,
+        "bound": work.bound(ceilings),
+        "floor ms": floor,
+        "ms": ms,
+        "x floor": ms / floor,
+        "H200 floor us": 1e3 * work.floor_ms(H200, low_precision=True),
+    }
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

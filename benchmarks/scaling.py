@@ -1,0 +1,250 @@
+"""How time and memory grow with each size, fitted: points, keypoints, crops, hypotheses, seeds of a bin, devices.
+
+python -m benchmarks.scaling [--repeats 9] [--json FILE] [--picture FILE.png]
+
+Fits are non-negative sums of a constant, a part in proportion to the size and one to its square; the bend is where the
+square overtakes the rest.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from flax import nnx
+from jaxtyping import Float
+
+from benchmarks.network_cases import make_case
+from benchmarks.stages import small_case
+from benchmarks.synthetic import synthetic_matches
+from benchmarks.timing import Compiled, compile_for, time_in_turn
+from benchmarks.training import of_batch, throughput_rows
+from configs import find_config
+from experiments.evaluation.methods import padded
+from experiments.evaluation.plots import as_png, new_figure
+from kmn_jax.estimator.candidates import arrays_of
+from kmn_jax.estimator.part import make_part, save_part
+from kmn_jax.estimator.search import SearchConfig, crop_features, search, seed_keys, spread_seeds
+from kmn_jax.models import load_pretrained
+from kmn_jax.pose import RansacConfig, ransac
+from kmn_jax.report import print_table, write_json
+from kmn_jax.train.sharding import split_cpu
+
+
+class Sweep(NamedTuple):
+    """Calls of one kind at growing sizes."""
+
+    what: str
+    size: str
+    compiled: Mapping[int, tuple[Compiled, tuple[Any, ...]]]
+
+
+class Growth(NamedTuple):
+    """Milliseconds = constant + linear * size + square * size^2."""
+
+    constant: float
+    linear: float
+    square: float
+
+    def at(self, size: float) -> float:
+        """Return the milliseconds at a size."""
+        return self.constant + self.linear * size + self.square * size * size
+
+    @property
+    def bend(self) -> float | None:
+        """The size from which on the square is the larger part; None if there is no square."""
+        if self.square <= 0:
+            return None
+        half = self.linear / (2 * self.square)
+        return float(half + np.sqrt(half**2 + self.constant / self.square))
+
+
+def main(repeats: int = 9, json: Path | None = None, picture: Path | None = None) -> None:
+    """Run all sweeps.
+
+    Args:
+        repeats: timed rounds of each size.
+        json: where results go.
+        picture: where the plot goes.
+    """
+    split_cpu(2)
+    rows: list[dict[str, Any]] = []
+    fits: list[dict[str, Any]] = []
+    series: list[tuple[Sweep, list[float], Growth]] = []
+    for make in (point_sweep, keypoint_sweep, batch_sweep, hypothesis_sweep, seed_sweep):
+        sweep = make()
+        times = time_in_turn(
+            {str(size): partial(ready.function, *arguments) for size, (ready, arguments) in sweep.compiled.items()},
+            repeats,
+        )
+        ms = [times[str(size)].median_ms for size in sweep.compiled]
+        growth = fitted(list(sweep.compiled), ms)
+        series.append((sweep, ms, growth))
+        for (size, (ready, _)), each in zip(sweep.compiled.items(), ms, strict=True):
+            megabytes = ready.temporary_bytes / 1e6
+            rows.append({"what": sweep.what, "size": sweep.size, "n": size, "ms": each, "temporary MB": megabytes})
+        fits.append(
+            {
+                "what": sweep.what,
+                "size": sweep.size,
+                "constant ms": growth.constant,
+                "ms for each": growth.linear,
+                "ms for its square": growth.square,
+                "bend": growth.bend,
+            }
+        )
+    devices = device_rows(repeats)
+    objects = catalogue_rows()
+    print_table("time and temporary memory", rows)
+    print_table("fits", fits)
+    print_table("training over devices, here parts of one CPU", devices)
+    print_table("what an object takes", objects)
+    write_json(json, {"rows": rows, "fits": fits, "devices": devices, "objects": objects})
+    if picture is not None:
+        picture.write_bytes(_plot(series))
+
+
+def fitted(sizes: Sequence[int], ms: Sequence[float]) -> Growth:
+    """Return the growth that fits best, errors counted as shares of each time."""
+    from scipy.optimize import nnls
+
+    n = np.array(sizes, dtype=float)
+    columns = np.stack([np.ones_like(n), n, n**2], axis=1) / np.array(ms)[:, None]
+    scale = columns.max(axis=0)
+    solution, _ = nnls(columns / scale, np.ones(len(n)))
+    return Growth(*(float(value) for value in solution / scale))
+
+
+def point_sweep() -> Sweep:
+    """The published network with a cached object, over the points of a crop."""
+    case = make_case(1)
+    graphdef, length = case.model.graphdef, jnp.float32(1)
+    part = nnx.merge(graphdef, case.parameters).encode_object(case.clouds[0], case.keypoint_indices, length)
+
+    def cached(parameters: nnx.State, crop: jax.Array, part: jax.Array) -> Any:
+        network = nnx.merge(graphdef, parameters)
+        return network.match(network.encode_scene(crop, length), part)
+
+    sizes = (256, 512, 1024, 2048)
+    return _sweep("network", "points", cached, {n: (case.parameters, case.crops[0, :n], part) for n in sizes})
+
+
+def keypoint_sweep() -> Sweep:
+    """The pair head over keypoints."""
+    case = make_case(1)
+    graphdef = case.model.graphdef
+    scene = jax.random.normal(jax.random.key(0), (2048, 512))
+
+    def match(parameters: nnx.State, scene: jax.Array, part: jax.Array) -> Any:
+        return nnx.merge(graphdef, parameters).match(scene, part)
+
+    parts = {count: jax.random.normal(jax.random.key(1), (count, 128)) for count in (5, 20, 80, 320)}
+    return _sweep("pair head", "keypoints", match, {k: (case.parameters, scene, part) for k, part in parts.items()})
+
+
+def batch_sweep() -> Sweep:
+    """The published network with a cached object, over crops at once."""
+    case = make_case(16)
+    graphdef, length = case.model.graphdef, jnp.float32(1)
+    part = nnx.merge(graphdef, case.parameters).encode_object(case.clouds[0], case.keypoint_indices, length)
+
+    def many(parameters: nnx.State, crops: jax.Array, part: jax.Array) -> Any:
+        network = nnx.merge(graphdef, parameters)
+
+        def one(crop: jax.Array) -> Any:
+            return network.match(network.encode_scene(crop, length), part)
+
+        return jax.lax.map(one, crops) if jax.default_backend() == "cpu" else jax.vmap(one)(crops)
+
+    return _sweep("network", "crops", many, {n: (case.parameters, case.crops[:n], part) for n in (1, 2, 4, 8, 16)})
+
+
+def hypothesis_sweep() -> Sweep:
+    """RANSAC over hypotheses, each scored against 2048 matches."""
+    key = jax.random.key(0)
+    matches, _ = synthetic_matches(key)
+    compiled = {}
+    for count in (125, 500, 2000, 8000):
+        config = RansacConfig(num_hypotheses=count, num_candidates=16_384)
+        compiled[count] = (compile_for(lambda k, m, c=config: ransac(k, m, c), key, matches), (key, matches))
+    return Sweep("RANSAC", "hypotheses", compiled)
+
+
+def seed_sweep() -> Sweep:
+    """Crops of one scan, from points to refined poses, over their number."""
+    model = load_pretrained("small")
+    found, case = small_case()
+    part, scene, config = arrays_of(model, make_part(found, model)), padded(case.points), SearchConfig()
+
+    def poses(parameters: nnx.State, part: Any, scene: Any, keys: Any) -> Any:
+        count = len(keys[0])
+        rows, real = spread_seeds(scene, scene.mask, count)
+        crops = crop_features(
+            model.graphdef,
+            parameters,
+            scene,
+            rows,
+            real,
+            part.diameter,
+            keys[0],
+            config=config,
+            num_points=model.config.num_scene_points,
+        )
+        return search(model.graphdef, parameters, part, crops, keys[1], config=config)
+
+    keys = {count: seed_keys(jax.random.key(0), count) for count in (1, 4, 16, 64)}
+    return _sweep("crops to poses", "seeds", poses, {n: (model.parameters, part, scene, k) for n, k in keys.items()})
+
+
+def device_rows(repeats: int) -> list[dict[str, Any]]:
+    """Time a training step of `small` on each number of devices."""
+    on_cpu = jax.default_backend() == "cpu"
+    config = of_batch(replace(find_config("small")), 16, on_cpu)
+    counts = [count for count in (1, 2, 4, 8) if count <= len(jax.devices())]
+    return [row for count in counts for row in throughput_rows(config, count, repeats)]
+
+
+def catalogue_rows() -> list[dict[str, Any]]:
+    """Measure what one object of a catalogue takes on disk and on the device, and how long it takes to encode."""
+    model = load_pretrained("small")
+    found, _ = small_case()
+    part = make_part(found, model)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "part.kmn"
+        save_part(part, path)
+        stored = path.stat().st_size
+    held = sum(leaf.nbytes for leaf in jax.tree.leaves(arrays_of(model, part)))
+    ms = time_in_turn({"encode": lambda: make_part(found, model)}, 9)["encode"].median_ms
+    return [{"network": "small", "card kB": stored / 1e3, "on the device kB": held / 1e3, "encode ms": ms}]
+
+
+def _sweep(what: str, size: str, function: Callable[..., Any], cases: Mapping[int, tuple[Any, ...]]) -> Sweep:
+    return Sweep(what, size, {n: (compile_for(function, *arguments), arguments) for n, arguments in cases.items()})
+
+
+def _plot(series: Sequence[tuple[Sweep, list[float], Growth]]) -> bytes:
+    figure, canvas = new_figure((3.2 * len(series), 3.4))
+    for axes, (sweep, ms, growth) in zip(figure.subplots(1, len(series)), series, strict=True):
+        sizes = list(sweep.compiled)
+        places: Float[np.ndarray, " p"] = np.geomspace(sizes[0], sizes[-1], 50)
+        axes.loglog(sizes, ms, "o", ms=5, color="C0")
+        axes.loglog(places, [growth.at(place) for place in places], lw=1.2, color="C0")
+        memory = [ready.temporary_bytes / 1e6 for ready, _ in sweep.compiled.values()]
+        axes.loglog(sizes, memory, "s:", ms=4, lw=1, color="C1")
+        axes.set_title(sweep.what, fontsize=10)
+        axes.set_xlabel(sweep.size)
+        axes.grid(alpha=0.3)
+    figure.axes[0].set_ylabel("ms (blue), temporary MB (orange)")
+    return as_png(canvas)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

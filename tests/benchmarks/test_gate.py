@@ -1,0 +1,47 @@
+from __future__ import annotations
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks import gate
+from benchmarks.network_cases import make_case
+from kmn_jax.checks import InputError
+
+
+def test_a_ratio_that_has_fallen_too_far_is_named() -> None:
+    baseline = {"a": 10.0, "b": 10.0, "c": 10.0}
+    rows, slower = gate.compared({"a": 10.1, "b": 10 * gate.LEAST + 0.01, "c": 10 * gate.LEAST - 0.01}, baseline)
+    assert slower == ["c"]
+    assert [row["pair"] for row in rows] == ["a", "b", "c"]
+    assert all(row["least"] == pytest.approx(10 * gate.LEAST) for row in rows)
+
+
+def test_a_baseline_of_other_pairs_is_refused() -> None:
+    with pytest.raises(InputError, match="'b', 'c'"):
+        gate.compared({"a": 1.0, "b": 1.0}, {"a": 1.0, "c": 1.0})
+
+
+def test_the_committed_baseline_says_where_it_is_from() -> None:
+    found = json.loads(gate.BASELINE.read_text(encoding="utf-8"))
+    assert all(ratio > 1 for ratio in found["ratios"].values())
+    assert found["environment"]["platform"] == "cpu"
+
+
+def test_both_sides_of_a_pair_compute_the_same() -> None:
+    case = make_case(1)
+    for pair in (gate.network_pair(case), gate.head_pair(case)):
+        for ours, plain in zip(pair.ours(), pair.plain(), strict=True):
+            plain = np.asarray(plain).reshape(np.shape(ours))
+            np.testing.assert_allclose(ours, plain, atol=2e-4 * np.ptp(plain))
+    pair = gate.gradient_pair(case)
+    ours, plain = (jax.tree.leaves(side()) for side in pair)
+    largest = max(float(np.abs(leaf).max()) for leaf in plain)
+    assert len(ours) == len(plain)
+    assert sum(leaf.size for leaf in ours) == sum(leaf.size for leaf in plain)
+    assert sum(float(np.square(leaf).sum()) for leaf in map(np.asarray, ours)) == pytest.approx(
+        sum(float(np.square(leaf).sum()) for leaf in map(np.asarray, plain)), rel=1e-2
+    )
+    assert largest > 0
