@@ -20,7 +20,7 @@ from kmn_jax.pose import adi
 
 ASSETS = Path(experiments.__file__).parent / "assets"
 IMAGE = max((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))
-CONFIG = BinPosesConfig(num_seeds=12, max_points=16_384)
+CONFIG = BinPosesConfig(num_seeds=32)
 FLOOR_MARGIN = 3.0  # mm
 
 
