@@ -1,7 +1,8 @@
 """Checks at the Python edge: one clear error that names the argument, what is wrong and what to do.
 
 Every public function that takes a user's arrays calls these first. Shapes and dtypes are checked always;
-values only outside of a trace, since a traced array has none (inside jit, failure is data: see PoseResult).
+values wherever there are any: a traced array has none (inside jit, failure is data: see PoseResult), but a constant
+inside of a trace has.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def float_array(
     array = _array(value, name, shape)
     if not jnp.issubdtype(array.dtype, jnp.floating):
         raise InputError(f"{name} has dtype {array.dtype}, but must be floating point: convert it to float32")
-    if finite and not is_traced(array) and not is_traced(mask) and not bool(_all_finite(array, mask)):
+    if finite and not is_traced(array) and not is_traced(mask) and not _is_finite(array, mask):
         good = np.isfinite(np.asarray(array, dtype=np.float32))
         if mask is not None:
             good = good | ~np.asarray(mask).reshape(mask.shape + (1,) * (good.ndim - mask.ndim))
@@ -60,7 +61,8 @@ def row_count(value: ArrayInput, name: str) -> int:
 def mask_array(value: ArrayInput | None, name: str, length: int) -> jax.Array:
     """Return a boolean mask of `length`; None means that every row is real."""
     if value is None:
-        return jnp.ones(length, dtype=bool)
+        with jax.ensure_compile_time_eval():
+            return jnp.ones(length, dtype=bool)
     array = _array(value, name, (length,))
     if array.dtype != jnp.bool_:
         raise InputError(f"{name} has dtype {array.dtype}, but must be bool (true = real, false = padding)")
@@ -73,7 +75,8 @@ def index_array(value: ArrayInput, name: str, length: int | None, upper: int) ->
     if not jnp.issubdtype(array.dtype, jnp.integer):
         raise InputError(f"{name} has dtype {array.dtype}, but must hold integers")
     if not is_traced(array) and array.size:
-        low, high = int(np.min(array)), int(np.max(array))
+        values = np.asarray(array)
+        low, high = int(values.min()), int(values.max())
         if low < 0 or high >= upper:
             raise InputError(f"{name} holds indices from {low} to {high}, outside of [0, {upper})")
     return array
@@ -101,6 +104,11 @@ def rigid_pose(value: ArrayInput, name: str) -> jax.Array:
     return array
 
 
+def _is_finite(array: jax.Array, mask: jax.Array | None) -> bool:
+    with jax.ensure_compile_time_eval():
+        return bool(_all_finite(array, mask))
+
+
 @jax.jit
 def _all_finite(array: jax.Array, mask: jax.Array | None) -> jax.Array:
     finite = jnp.isfinite(array)
@@ -110,7 +118,8 @@ def _all_finite(array: jax.Array, mask: jax.Array | None) -> jax.Array:
 
 
 def _array(value: ArrayInput, name: str, shape: tuple[int | None, ...]) -> jax.Array:
-    with np.errstate(over="ignore"):  # what does not fit float32 becomes infinite, which is reported as such
+    # What does not fit float32 becomes infinite, which is reported as such.
+    with jax.ensure_compile_time_eval(), np.errstate(over="ignore"):
         array = value if isinstance(value, jax.Array) else jnp.asarray(_numbers(value, name))
     if array.ndim != len(shape) or any(want not in (None, have) for want, have in zip(shape, array.shape, strict=True)):
         wanted = ", ".join("any" if want is None else str(want) for want in shape)

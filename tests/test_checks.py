@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,6 +46,28 @@ def test_traced_values_are_checked_by_shape_only() -> None:
     assert bool(jnp.isnan(doubled(jnp.array([jnp.nan]))).all())
     with pytest.raises(InputError, match="shape"):
         jax.jit(lambda x: float_array(x, "x", (2,)))(jnp.ones(3))
+
+
+@pytest.mark.parametrize("transform", [jax.jit, jax.grad])
+@pytest.mark.parametrize("kind", [jnp.asarray, np.asarray, list])
+def test_constants_inside_a_trace_are_checked_as_outside(
+    transform: Callable[..., Any], kind: Callable[..., Any]
+) -> None:
+    def total(constant: list[float], rows: list[int]) -> jax.Array:
+        held, taken = kind(constant), kind(rows)
+
+        def of(x: jax.Array) -> jax.Array:
+            mask = mask_array(None, "mask", 2)
+            both = float_array(x, "x", (2,), mask=mask) + float_array(held, "constant", (2,), mask=mask)
+            return both[index_array(taken, "rows", 2, 2)].sum()
+
+        return transform(of)(jnp.ones(2))
+
+    assert np.isfinite(total([1.0, 2.0], [0, 1])).all()
+    with pytest.raises(InputError, match=r"constant holds 1 values"):
+        total([1.0, float("nan")], [0, 1])
+    with pytest.raises(InputError, match=r"rows holds indices from 0 to 7"):
+        total([1.0, 2.0], [0, 7])
 
 
 def test_masks_indices_and_scalars() -> None:

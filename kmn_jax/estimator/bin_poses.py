@@ -18,24 +18,16 @@ from jaxtyping import Array, Bool, Float, Int
 from kmn_jax.checks import InputError
 from kmn_jax.data.splat import Surfels
 from kmn_jax.estimator.calibrate import Calibration
-from kmn_jax.estimator.candidates import arrays_of, surfels_of
+from kmn_jax.estimator.candidates import surfels_of
 from kmn_jax.estimator.evidence import Sight, evidence_of
-from kmn_jax.estimator.part import Part
-from kmn_jax.estimator.search import (
-    PartArrays,
-    SceneArrays,
-    SearchConfig,
-    crop_features,
-    each,
-    search,
-    seed_keys,
-    spread_rows,
-    spread_seeds,
-)
-from kmn_jax.estimator.select import SelectConfig, distances, overlaps, padded_symmetries, same_place
+from kmn_jax.estimator.part import Part, PartArrays, arrays_of
+from kmn_jax.estimator.scan_crop import SceneArrays
+from kmn_jax.estimator.search import SearchConfig, crop_features, each, search, seed_keys, spread_rows, spread_seeds
+from kmn_jax.estimator.select import SelectConfig, overlap, padded_symmetries, same_place
 from kmn_jax.estimator.verify import VerifyConfig
 from kmn_jax.geometry import depth_to_points, transform_points
 from kmn_jax.models import Model
+from kmn_jax.pose import mssd
 from kmn_jax.typing import Pose, PRNGKey, Scalar
 
 
@@ -43,7 +35,7 @@ from kmn_jax.typing import Pose, PRNGKey, Scalar
 class BinPosesConfig:
     """How a bin is searched in one call."""
 
-    num_seeds: int = 32  # crops that are searched: one and a half for each copy that may be seen
+    num_seeds: int = 32  # crops that are searched: more than copies that may be seen, as some share one
     max_points: int = 32_768  # of the image that are kept, evenly over all that were measured
     search: SearchConfig = field(default_factory=SearchConfig)
     verify: VerifyConfig = field(default_factory=VerifyConfig)
@@ -177,9 +169,8 @@ def _standing(
     relevant = near[first, second] & there[first] & there[second]
 
     def exclude(pose: Pose, other: Pose) -> Bool[Array, ""]:
-        pair = jnp.stack([pose, other])[None]
-        apart = distances(pair, points, part.symmetries)[0]
-        shared = overlaps(pair, points, normals, spacing, config.depth * diameter)[0]
+        apart = mssd(pose, other, points, part.symmetries)
+        shared = overlap(pose, other, points, normals, spacing, config.depth * diameter)
         return (apart <= part.reach) | (shared > config.overlap)
 
     pairs = each(exclude, relevant, poses[first], poses[second])

@@ -16,13 +16,12 @@ from kmn_jax.data.splat import Surfels, intrinsics
 from kmn_jax.estimator.evidence import Sight, evidence_of
 from kmn_jax.estimator.halves import in_halves
 from kmn_jax.estimator.improve import ImproveConfig, improve, main_turns
-from kmn_jax.estimator.part import Part
+from kmn_jax.estimator.part import Part, arrays_of
 from kmn_jax.estimator.result import CropPrediction
 from kmn_jax.estimator.scene import LEAST_POINTS, Scene, nearest_row, padded_flags
 from kmn_jax.estimator.search import (
     CropFeatures,
     Hypotheses,
-    PartArrays,
     Predictions,
     SearchConfig,
     crop_features,
@@ -285,13 +284,6 @@ def _crops(
 
         scene.features[name] = in_halves(encoded, seeds.rows, seeds.real, keys)
     return scene.features[name]
-
-
-def arrays_of(model: Model, part: Part) -> PartArrays:
-    """Return what a search needs of a part."""
-    count = model.config.num_object_points
-    points, normals = jnp.asarray(part.points[:count]), jnp.asarray(part.normals[:count])
-    return PartArrays(points, normals, jnp.asarray(part.features), jnp.float32(part.diameter))
 
 
 def surfels_of(part: Part) -> Surfels:

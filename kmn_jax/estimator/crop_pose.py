@@ -1,23 +1,28 @@
 """The pose of the copy in the middle of one crop, from points to pose in one compiled call.
 
-The network sees several draws of the crop's points, as another draw often succeeds where one fails. Of all poses that
-their matches agree on, the one that the measured surface confirms best is chosen.
+The network sees several draws of the crop's points, as another draw often succeeds where one fails, but no more once
+the measured surface confirms a pose well enough. Of all poses that the matches of a draw agree on, the one that it
+confirms best is chosen.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
+from math import isfinite
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Bool, Float, Int, Key, Shaped
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
 from kmn_jax.data.crops import Crop, CropConfig, crop_around
-from kmn_jax.data.smoothing import SmoothConfig
-from kmn_jax.estimator.search import PartArrays, SceneArrays, as_visible
+from kmn_jax.data.smoothing import SmoothConfig, smoothed
+from kmn_jax.estimator.part import PartArrays
+from kmn_jax.estimator.scan_crop import SceneArrays, as_visible
+from kmn_jax.geometry import orient_to_camera
+from kmn_jax.geometry.ball_normals import normals_within_radius
 from kmn_jax.models import KeyMatchNet
 from kmn_jax.pose import (
     IcpConfig,
@@ -38,14 +43,15 @@ from kmn_jax.typing import Pose, PRNGKey, Scalar
 class CropPoseConfig:
     """How a pose is found in a crop; lengths are shares of the object's diameter."""
 
-    num_draws: int = 4  # of points that the network sees
+    num_draws: int = 4  # of points that the network sees, at most
+    enough: float | None = 0.7  # of `surface_scores`, -1 to 3: then no more draws are made; None: all are made
     num_modes: int = 4  # poses of each draw that are compared with the surface
     matches: MatchConfig = field(default_factory=lambda: MatchConfig(capacity=1024))
     ransac: RansacConfig = field(default_factory=lambda: RansacConfig(num_hypotheses=500, num_candidates=8192))
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     surface_points: int = 128  # on the object
     smooth: SmoothConfig | None = field(default_factory=SmoothConfig)
-    normal_points: int = 4096  # of the crop, from which normals are estimated
+    normal_points: int = 4096  # of the crop at least, from which normals are estimated
     icp: IcpConfig | None = None  # refines the pose on the points of its draw
 
     def __post_init__(self) -> None:
@@ -55,6 +61,8 @@ class CropPoseConfig:
                 f"num_draws = {self.num_draws}, num_modes = {self.num_modes} and surface_points ="
                 f" {self.surface_points} must be 1 or more"
             )
+        if self.enough is not None and not isfinite(self.enough):
+            raise ValueError(f"enough = {self.enough} must be finite; None makes all draws")
 
 
 class Said(NamedTuple):
@@ -72,45 +80,64 @@ class Said(NamedTuple):
         return self.mask & (self.segmentation[..., 1] > self.segmentation[..., 0])
 
 
-def drawn_crop(
-    scene: SceneArrays,
-    diameter: Scalar,
-    key: PRNGKey,
-    num_points: int,
-    normal_points: int,
-    smooth: SmoothConfig | None,
-) -> Crop:
-    """Return some of the points within a diameter of a scene's first point, with their normals, relative to it."""
-    crops = CropConfig(
-        num_points=num_points,
-        max_noise=0.0,
-        normal_points=normal_points,
-        min_points=min(16, num_points),
-        smooth=smooth,
-    )
-    nowhere = jnp.zeros((1, 3)), jnp.eye(4)[None]
-    return crop_around(key, as_visible(scene), jnp.int32(0), jnp.bool_(True), *nowhere, diameter, crops)
+class Searched(NamedTuple):
+    """What the draws that were made say and find; those that were not have no points, and no pose."""
+
+    num_draws: Int[Array, ""]  # that were made
+    said: Said  # of d draws
+    poses: PoseResult  # (d, h, ...), relative to the crop's seed
+    scores: Float[Array, "d h"]  # see `surface_scores`, by the points of their draw and of those before: more, later on
+
+
+class Draw(NamedTuple):
+    """Some of a crop's points, the seed first, smoothed; with their normals, towards the camera."""
+
+    points: Float[Array, "n 3"]  # relative to the crop's seed as it was measured
+    normals: Float[Array, "n 3"]
+    mask: Bool[Array, " n"]
 
 
 def crop_for_draws(part: PartArrays, scene: SceneArrays, key: PRNGKey, num_points: int, config: CropPoseConfig) -> Crop:
-    """Return the crop around a scene's first point that holds all draws, as `crop_pose` takes it with the same key."""
-    count = config.num_draws * (num_points - 1) + 1
-    return drawn_crop(scene, part.diameter, _crop_key(key), count, config.normal_points, config.smooth)
+    """Return the crop around a scene's first point as `crop_pose` takes it with the same key, without normals."""
+    count = max(config.num_draws * (num_points - 1) + 1, config.normal_points)
+    crops = CropConfig(num_points=count, normals="surface", max_noise=0.0, min_points=min(16, num_points))
+    nowhere = jnp.zeros((1, 3)), jnp.eye(4)[None]
+    seed_row, found = jnp.int32(0), jnp.bool_(True)
+    return crop_around(_crop_key(key), as_visible(scene), seed_row, found, *nowhere, part.diameter, crops)
 
 
-def said_of_draws(network: KeyMatchNet, part: PartArrays, crop: Crop, config: CropPoseConfig) -> Said:
-    """Return what the network says of each draw of a crop's points; its fields are (d, ...)."""
-    count = config.num_draws
-    num_points = (crop.points.shape[0] - 1) // count + 1
+def draw_of_crop(
+    crop: Crop, draw: Int[ArrayLike, ""], diameter: Scalar, num_points: int, config: CropPoseConfig
+) -> Draw:
+    """Return one draw of a crop, evenly over its points.
 
-    def one(draw: Int[Array, ""]) -> Said:
-        # Each has the seed, and every so many-th of the others: also where there are fewer than asked for.
-        rows = jnp.concatenate([jnp.zeros(1, jnp.int32), 1 + draw + count * jnp.arange(num_points - 1)])
-        points, normals, mask = crop.points[rows], crop.normals[rows], crop.mask[rows]
-        features = network.encode_scene(jnp.concatenate([points, normals], axis=1), part.diameter, mask)
-        return Said(points, normals, mask, *network.match(features, part.features, mask))
+    Draws share only the seed, unless the points are too few for that: each gets as many as it has room for.
+    """
+    others = num_points - 1
+    slots = max(config.num_draws * others, 1)  # of all draws, which lie evenly over the points
+    total = jnp.maximum(crop.mask.sum(dtype=jnp.int32) - 1, others)
+    slot = jnp.arange(others, dtype=jnp.int32) * config.num_draws + jnp.asarray(draw, dtype=jnp.int32)
+    spread = slot * (total // slots) + slot * (total % slots) // slots  # slot * total may be beyond int32
+    rows = jnp.concatenate([jnp.zeros(1, jnp.int32), 1 + spread])
+    mask = crop.mask[rows]
+    points = jnp.where(mask[:, None], crop.points[rows], 0)
+    if config.smooth is None:
+        normals, known = normals_within_radius(points, crop.points, CropConfig.normal_radius * diameter, crop.mask)
+    else:
+        points, normals, known, _ = smoothed(points, mask, crop.points, crop.mask, diameter, config.smooth)
+    to_camera = -crop.seed[None] - points
+    length = jnp.sqrt((to_camera**2).sum(axis=1, keepdims=True))
+    normals = jnp.where(
+        known[:, None], orient_to_camera(points, normals, -crop.seed), to_camera / jnp.where(length > 0, length, 1)
+    )
+    return Draw(points, jnp.where(mask[:, None], normals, 0), mask)
 
-    return jax.lax.map(one, jnp.arange(count, dtype=jnp.int32))
+
+def said_of_draw(network: KeyMatchNet, part: PartArrays, draw: Draw) -> Said:
+    """Return what the network says of a draw."""
+    points = jnp.where(draw.mask[:, None], draw.points - draw.points[:1], 0)  # as it sees them: from the seed's place
+    features = network.encode_scene(jnp.concatenate([points, draw.normals], axis=1), part.diameter, draw.mask)
+    return Said(*draw, *network.match(features, part.features, draw.mask))
 
 
 def matches_of(said: Said, part: PartArrays, config: MatchConfig) -> Matches:
@@ -129,25 +156,51 @@ def matches_of(said: Said, part: PartArrays, config: MatchConfig) -> Matches:
     )
 
 
-def poses_of_draws(
+def poses_of_draw(
     said: Said, valid: Bool[Array, ""], part: PartArrays, key: PRNGKey, config: CropPoseConfig
 ) -> PoseResult:
-    """Return the poses that the matches of each draw agree on, (d * h, ...), relative to the crop's seed."""
+    """Return the poses that the matches of a draw agree on, (h, ...), relative to the crop's seed."""
+    matches = matches_of(said, part, config.matches)
+    return ransac_modes(key, matches._replace(mask=matches.mask & valid), config.num_modes, config.ransac)
 
-    def one(item: tuple[Said, Key[Array, ""]]) -> PoseResult:
-        draw, key = item
-        matches = matches_of(draw, part, config.matches)
-        return ransac_modes(key, matches._replace(mask=matches.mask & valid), config.num_modes, config.ransac)
 
+def search_draws(
+    network: KeyMatchNet, part: PartArrays, crop: Crop, key: PRNGKey, num_points: int, config: CropPoseConfig
+) -> Searched:
+    """Make draws of a crop's points, until a pose is confirmed well enough by the points of those so far."""
     keys = jax.random.split(_pose_key(key), config.num_draws)
-    found: PoseResult = jax.tree.map(_flat, jax.lax.map(one, (said, keys)))
-    return found
+
+    def one(draw: Int[Array, ""]) -> tuple[Said, PoseResult]:
+        said = said_of_draw(network, part, draw_of_crop(crop, draw, part.diameter, num_points, config))
+        return said, poses_of_draw(said, crop.valid, part, keys[draw], config)
+
+    def more(state: Searched) -> Bool[Array, ""]:
+        left = (state.num_draws < config.num_draws) & (crop.valid | (state.num_draws == 0))
+        return left if config.enough is None else left & (state.scores.max() < config.enough)
+
+    def make(state: Searched) -> Searched:
+        draw = state.num_draws
+        new_said, new_poses = one(draw)
+        said = jax.tree.map(lambda leaf, new: leaf.at[draw].set(new), state.said, new_said)
+        poses = jax.tree.map(lambda leaf, new: leaf.at[draw].set(new), state.poses, new_poses)
+        scores = surface_scores(new_poses, said, crop.seed, part, config)
+        return Searched(draw + 1, said, poses, state.scores.at[draw].set(scores))
+
+    def none(leaf: jax.ShapeDtypeStruct) -> Array:
+        return jnp.zeros((config.num_draws, *leaf.shape), leaf.dtype)
+
+    said, poses = jax.tree.map(none, jax.eval_shape(one, jnp.int32(0)))
+    scores = jnp.full((config.num_draws, config.num_modes), -jnp.inf)
+    return jax.lax.while_loop(more, make, Searched(jnp.int32(0), said, poses, scores))
 
 
 def surface_scores(
     poses: PoseResult, said: Said, seed: Float[Array, "3"], part: PartArrays, config: CropPoseConfig
 ) -> Float[Array, " p"]:
-    """Return how well the points of all draws confirm each pose; minus infinity where there is none."""
+    """Return how well the points of all draws that were made confirm each pose; minus infinity where there is none.
+
+    A score is that of `surface_agreement` and the share of matches that agree, -1 to 3 in sum.
+    """
     surface, normals = part.points[: config.surface_points], part.normals[: config.surface_points]
     points, point_normals, mask, on_object = map(_flat, (said.points, said.normals, said.mask, said.on_object))
 
@@ -188,12 +241,11 @@ def crop_pose(
     made for. Inlier counts are those of the matches of the draw that the pose is from, its mask that draw's.
     """
     crop = crop_for_draws(part, scene, key, num_points, config)
-    said = said_of_draws(nnx.merge(graphdef, parameters), part, crop, config)
-    poses = poses_of_draws(said, crop.valid, part, key, config)
-    best = jnp.argmax(surface_scores(poses, said, crop.seed, part, config))
-    found: PoseResult = jax.tree.map(lambda leaf: leaf[best], poses)
+    _, said, poses, scores = search_draws(nnx.merge(graphdef, parameters), part, crop, key, num_points, config)
+    best, mode = jnp.unravel_index(jnp.argmax(scores), scores.shape)
+    found: PoseResult = jax.tree.map(lambda leaf: leaf[best, mode], poses)
     if config.icp is not None:
-        draw: Said = jax.tree.map(lambda leaf: leaf[best // config.num_modes], said)
+        draw: Said = jax.tree.map(lambda leaf: leaf[best], said)
         found = found._replace(T_scene_object=refined(found, draw, part, config.icp))
     return found._replace(T_scene_object=found.T_scene_object.at[:3, 3].add(jnp.where(found.converged, crop.seed, 0)))
 

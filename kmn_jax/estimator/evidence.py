@@ -10,7 +10,8 @@ from jaxtyping import Array, Bool, Float
 
 from kmn_jax.data.splat import Intrinsics, Surfels
 from kmn_jax.estimator.contour import contour
-from kmn_jax.estimator.search import CropFeatures, Hypotheses, PartArrays, Predictions, each
+from kmn_jax.estimator.part import PartArrays
+from kmn_jax.estimator.search import CropFeatures, Hypotheses, Predictions, each
 from kmn_jax.estimator.verify import VerifyConfig, agreement
 from kmn_jax.geometry import inverse, nearest, transform_points
 from kmn_jax.typing import Scalar

@@ -17,8 +17,8 @@ from kmn_jax.estimator.candidates import NUM_SEEDS
 from kmn_jax.estimator.estimator import PoseEstimator
 from kmn_jax.estimator.evidence import Sight
 from kmn_jax.estimator.part import Part
+from kmn_jax.estimator.scan_crop import SceneArrays
 from kmn_jax.estimator.scene import LEAST_POINTS
-from kmn_jax.estimator.search import SceneArrays
 from kmn_jax.estimator.verify import depth_buffer
 from kmn_jax.files import write_whole
 

@@ -20,7 +20,8 @@ from kmn_jax.data.crops import CropConfig, crop_around
 from kmn_jax.data.splat import Surfels
 from kmn_jax.estimator.evidence import Sight
 from kmn_jax.estimator.part import Part
-from kmn_jax.estimator.search import SceneArrays, as_visible, each, spread_rows
+from kmn_jax.estimator.scan_crop import SceneArrays, as_visible
+from kmn_jax.estimator.search import each, spread_rows
 from kmn_jax.estimator.select import padded_symmetries
 from kmn_jax.estimator.verify import VerifyConfig, agreement
 from kmn_jax.geometry import compose, inverse, nearest, transform_points

@@ -6,11 +6,13 @@ import hashlib
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from safetensors.numpy import save
 
 from kmn_jax.checks import InputError
@@ -19,6 +21,7 @@ from kmn_jax.data.mesh_files import METRES, check_unit
 from kmn_jax.data.symmetry import Symmetries
 from kmn_jax.files import read_safetensors, write_whole
 from kmn_jax.models import Model, encode_object
+from kmn_jax.typing import Scalar
 
 _FORMAT = "kmn_jax object card 1"
 _LIMIT = 1_000_000  # bytes of a card
@@ -79,6 +82,15 @@ def model_digest(model: Model) -> str:
         digest.update(".".join(map(str, path)).encode())
         digest.update(np.ascontiguousarray(np.asarray(value[...], dtype=np.float32)).tobytes())
     return digest.hexdigest()
+
+
+class PartArrays(NamedTuple):
+    """What a search needs of an object, in the scene's unit; the first K points are the keypoints."""
+
+    points: Float[Array, "m 3"]
+    normals: Float[Array, "m 3"]
+    features: Float[Array, "k o"]
+    diameter: Scalar
 
 
 def make_part(found: ObjectModel, model: Model, digest: str | None = None) -> Part:
@@ -207,3 +219,10 @@ def _part(tensors: dict[str, np.ndarray], facts: dict[str, object]) -> Part:
         source_digest=str(facts["source_digest"]),
         model_digest=str(facts["model_digest"]),
     )
+
+
+def arrays_of(model: Model, part: Part) -> PartArrays:
+    """Return what a search needs of a part."""
+    count = model.config.num_object_points
+    points, normals = jnp.asarray(part.points[:count]), jnp.asarray(part.normals[:count])
+    return PartArrays(points, normals, jnp.asarray(part.features), jnp.float32(part.diameter))

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int
 
 from kmn_jax.checks import InputError
-from kmn_jax.estimator.search import CropFeatures, SceneArrays
-from kmn_jax.estimator.view import View, padded_points
+from kmn_jax.estimator.scan_crop import SceneArrays, padded_points
+from kmn_jax.estimator.search import CropFeatures
+from kmn_jax.estimator.view import View
 
 LEAST_POINTS = 4096  # the smallest capacity that is compiled
 _IMAGE_STEP = 256  # depth images are padded to a multiple of it

@@ -13,7 +13,8 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from kmn_jax.data.crops import CropConfig, crop_around
-from kmn_jax.data.splat import BIN, VisiblePoints
+from kmn_jax.estimator.part import PartArrays
+from kmn_jax.estimator.scan_crop import SceneArrays, as_visible
 from kmn_jax.geometry import farthest_point_indices
 from kmn_jax.pose import IcpConfig, MatchConfig, PoseResult, RansacConfig, find_matches, icp, ransac_modes
 from kmn_jax.typing import PRNGKey, Scalar
@@ -32,22 +33,6 @@ class SearchConfig:
     icp_points: int = 128  # of a crop, on the object
     normal_radius: float = 0.06
     normal_points: int = 4096  # drawn around a seed for normals; the network's number of them is the crop
-
-
-class PartArrays(NamedTuple):
-    """What a search needs of an object, in the scene's unit; the first K points are the keypoints."""
-
-    points: Float[Array, "m 3"]
-    normals: Float[Array, "m 3"]
-    features: Float[Array, "k o"]
-    diameter: Scalar
-
-
-class SceneArrays(NamedTuple):
-    """A scan in its sensor's frame, padded to a capacity: the sensor is at the origin."""
-
-    points: Float[Array, "r 3"]
-    mask: Bool[Array, " r"]
 
 
 class CropFeatures(NamedTuple):
@@ -212,16 +197,4 @@ def each(function: Callable[..., _Result], real: Bool[Array, " s"], *items: Any)
 
     return jax.lax.platform_dependent(
         real, *items, cpu=lambda *items: jax.lax.map(lambda item: one(*item), items), default=jax.vmap(one)
-    )
-
-
-def as_visible(scene: SceneArrays) -> VisiblePoints:
-    """Return a scan as visible points that all count alike."""
-    return VisiblePoints(
-        points=scene.points,
-        normals=jnp.zeros_like(scene.points),
-        picture_area=jnp.ones_like(scene.points[:, 0]),
-        instance=jnp.full(scene.mask.shape, BIN, dtype=jnp.int32),
-        mask=scene.mask,
-        visible_fraction=jnp.ones(1),
     )

@@ -15,7 +15,7 @@ from kmn_jax.data.symmetry import Symmetries
 from kmn_jax.estimator.part import Part
 from kmn_jax.geometry import compose, inverse, squared_distances, transform_points
 from kmn_jax.pose import discretise_symmetry, mssd
-from kmn_jax.typing import Normals, Points, Scalar
+from kmn_jax.typing import Normals, Points, Pose, Scalar
 
 _PAIRS = 64  # that are compared in one call: one number, so one compilation
 _ALIKE = 0.5  # cosine of normals
@@ -62,11 +62,8 @@ def distances(pairs: Float[Array, "p 2 4 4"], points: Points, symmetries: Float[
     return jax.lax.map(lambda pair: mssd(pair[0], pair[1], points, symmetries), pairs)
 
 
-@jax.jit
-def overlaps(
-    pairs: Float[Array, "p 2 4 4"], points: Points, normals: Normals, spacing: Scalar, depth: Scalar
-) -> Float[Array, " p"]:
-    """Return which share of the points of one part is in or on the other, the larger of the two, for pairs of poses.
+def overlap(pose: Pose, other: Pose, points: Points, normals: Normals, spacing: Scalar, depth: Scalar) -> Scalar:
+    """Return which share of the points of one part is in or on the other, the larger of the two.
 
     Points deeper than `depth` below the other's surface are in it; nearer ones with a normal like its own are on it.
     `spacing` is how far the points are apart.
@@ -74,7 +71,7 @@ def overlaps(
 
     offsets = (points * normals).sum(axis=1)
 
-    def share(pose: Float[Array, "4 4"], other: Float[Array, "4 4"]) -> Scalar:
+    def share(pose: Pose, other: Pose) -> Scalar:
         between = compose(inverse(other), pose)
         seen = transform_points(between, points)
         away = jnp.sqrt(squared_distances(seen, points))
@@ -90,7 +87,15 @@ def overlaps(
         on = flush & (nearest[:, 0] <= depth + spacing) & alike
         return ((height < -depth) | on).mean()
 
-    return jax.lax.map(lambda pair: jnp.maximum(share(pair[0], pair[1]), share(pair[1], pair[0])), pairs)
+    return jnp.maximum(share(pose, other), share(other, pose))
+
+
+@jax.jit
+def overlaps(
+    pairs: Float[Array, "p 2 4 4"], points: Points, normals: Normals, spacing: Scalar, depth: Scalar
+) -> Float[Array, " p"]:
+    """Return `overlap` of pairs of poses."""
+    return jax.lax.map(lambda pair: overlap(pair[0], pair[1], points, normals, spacing, depth), pairs)
 
 
 def accept(

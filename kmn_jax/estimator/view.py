@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.scan_files import Scan
 from kmn_jax.data.scene import Camera
 from kmn_jax.data.splat import intrinsics
+from kmn_jax.estimator.scan_crop import padded_points
 from kmn_jax.estimator.verify import depth_buffer
 
 _SIDE = 1024  # pixels along both sides of an image that is made of a cloud: one size, so one compilation
@@ -56,14 +56,6 @@ def view_of(scan: Scan, sensor: Float[np.ndarray, "3"] | None = None) -> View:
     padded, mask = padded_points(points)
     depth = _depth_buffer(padded, mask, intrinsics(camera), shape=(camera.height, camera.width))
     return View(T_scene_view, points, np.asarray(depth), camera, rows)
-
-
-def padded_points(points: Float32[np.ndarray, "n 3"], least: int = 2) -> tuple[Float[Array, "r 3"], Bool[Array, " r"]]:
-    """Return points with zeros after them, and which are real: few sizes, powers of two, are ever compiled for."""
-    capacity = max(least, 1 << (len(points) - 1).bit_length())
-    padded = np.zeros((capacity, 3), dtype=np.float32)
-    padded[: len(points)] = points
-    return jnp.asarray(padded), jnp.asarray(np.arange(capacity) < len(points))
 
 
 def _towards(direction: Float[np.ndarray, "3"], typical: float) -> Float[np.ndarray, "3 3"]:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from kmn_jax.geometry import inverse, transform_points
+from kmn_jax.geometry import inverse, squared_distances, transform_points
 from kmn_jax.geometry.knn import first_smallest
 from kmn_jax.typing import Mask, Normals, Points, Pose, Scalar
 
@@ -76,11 +76,11 @@ def surface_agreement(
 
     # As sums over coordinates and minima down columns, CPUs vectorise all of it and store no matrix.
     alike = (_cosines(scene_normals, normals) > config.min_cosine) & mask[:, None]
-    confirmed = jnp.where(alike, _squares(scene_points, surface), jnp.inf).min(axis=0) <= reach**2
+    confirmed = jnp.where(alike, squared_distances(scene_points, surface), jnp.inf).min(axis=0) <= reach**2
 
     # Of the measured lines of sight the one that passes nearest: does it end behind the surface?
     lines, ends = _directions(scene_points, camera)
-    nearest, beside = first_smallest(jnp.where(mask[:, None], _squares(lines, sight), jnp.inf))
+    nearest, beside = first_smallest(jnp.where(mask[:, None], squared_distances(lines, sight), jnp.inf))
     passes = beside * away**2 <= reach**2
     through = passes & (ends[nearest] - away > reach) & ~confirmed
 
@@ -88,15 +88,9 @@ def surface_agreement(
     local = transform_points(inverse(T_scene_object), scene_points)
     local_normals = jnp.matmul(scene_normals, T_scene_object[:3, :3], precision=highest)
     same = _cosines(object_normals, local_normals) > config.min_cosine
-    explained = jnp.where(same, _squares(object_points, local), jnp.inf).min(axis=0) <= reach**2
+    explained = jnp.where(same, squared_distances(object_points, local), jnp.inf).min(axis=0) <= reach**2
     taken = mask & on_object
     return SurfaceAgreement(_share(confirmed, faces), _share(through, faces), _share(explained, taken))
-
-
-def _squares(points: Float[Array, "a 3"], others: Float[Array, "b 3"]) -> Float[Array, "a b"]:
-    """Return squared distances, by differences: of unit vectors that nearly agree, products would leave no digit."""
-    x, y, z = (points[:, None, axis] - others[None, :, axis] for axis in range(3))
-    return x * x + y * y + z * z
 
 
 def _cosines(normals: Float[Array, "a 3"], others: Float[Array, "b 3"]) -> Float[Array, "a b"]:

@@ -9,7 +9,7 @@ import pytest
 
 from kmn_jax.data.crops import CropConfig, crop_around
 from kmn_jax.data.smoothing import SmoothConfig, smoothed
-from kmn_jax.estimator.search import SceneArrays, as_visible
+from kmn_jax.estimator.scan_crop import SceneArrays, as_visible
 
 smooth = jax.jit(smoothed, static_argnames="config")
 

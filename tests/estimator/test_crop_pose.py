@@ -12,15 +12,21 @@ import pytest
 from flax import nnx
 
 import experiments
-from experiments.evaluation.cases import Case, ObjectImages, draw_cases
-from experiments.evaluation.methods import padded
+from experiments.evaluation.cases import Case, ObjectImages, draw_cases, padded
 from experiments.evaluation.sources import bop_objects
-from kmn_jax.estimator.candidates import arrays_of
-from kmn_jax.estimator.crop_pose import CropPoseConfig, crop_for_draws, crop_pose, matches_of, said_of_draws
-from kmn_jax.estimator.part import make_part
-from kmn_jax.estimator.search import PartArrays, SceneArrays
+from kmn_jax.estimator.crop_pose import (
+    CropPoseConfig,
+    crop_for_draws,
+    crop_pose,
+    draw_of_crop,
+    matches_of,
+    said_of_draw,
+    search_draws,
+)
+from kmn_jax.estimator.part import PartArrays, arrays_of, make_part
+from kmn_jax.estimator.scan_crop import SceneArrays
 from kmn_jax.models import Model, load_model, released_file
-from kmn_jax.pose import PoseResult, adi, ransac
+from kmn_jax.pose import PoseResult, PoseStatus, adi, ransac
 
 SMALL = Path(experiments.__file__).parent / "assets" / "small_test_set"
 CONFIG = CropPoseConfig(num_draws=2, num_modes=2)
@@ -82,14 +88,59 @@ def test_one_draw_and_one_pose_are_the_published_search(model: Model, part: Part
     _, pose_key = jax.random.split(key)
     network = nnx.merge(model.graphdef, model.parameters)
     crop = jax.jit(crop_for_draws, static_argnums=(3, 4))(part, scene, key, 512, plain)
-    said = jax.jit(said_of_draws, static_argnums=(0, 3))(network, part, crop, plain)
-    first = jax.tree.map(lambda leaf: leaf[0], said)
-    matches = matches_of(first, part, plain.matches)
+    said = jax.jit(lambda crop: said_of_draw(network, part, draw_of_crop(crop, 0, part.diameter, 512, plain)))(crop)
+    matches = matches_of(said, part, plain.matches)
     alone = ransac(jax.random.split(pose_key, 1)[0], matches, plain.ransac)
     assert alone.converged
     np.testing.assert_allclose(found.T_scene_object[:3, :3], alone.T_scene_object[:3, :3], atol=1e-3)
     shift = np.asarray(found.T_scene_object)[:3, 3] - np.asarray(crop.seed) - np.asarray(alone.T_scene_object)[:3, 3]
     assert np.linalg.norm(shift) < 1e-3 * float(part.diameter)
+
+
+def test_no_more_draws_are_made_than_it_takes(model: Model, part: PartArrays, cases: list[Case]) -> None:
+    config, scene, key = replace(CONFIG, num_draws=3), padded(cases[0].points), jax.random.key(0)
+    network = nnx.merge(model.graphdef, model.parameters)
+    crop = jax.jit(crop_for_draws, static_argnums=(3, 4))(part, scene, key, 512, config)
+    search = jax.jit(search_draws, static_argnums=(0, 4, 5))
+    all_draws, one, none = (
+        search(network, part, crop, key, 512, replace(config, enough=enough)) for enough in (None, -9.0, 9.0)
+    )
+    assert [int(found.num_draws) for found in (all_draws, one, none)] == [3, 1, 3]
+    assert [int(jnp.isfinite(found.scores).any(axis=1).sum()) for found in (all_draws, one, none)] == [3, 1, 3]
+    # Programs that differ round differently.
+    poses = [found.poses.T_scene_object for found in (all_draws, none, one)]
+    np.testing.assert_allclose(poses[1], poses[0], atol=1e-3)
+    np.testing.assert_allclose(poses[2][0], poses[0][0], atol=1e-3)
+    np.testing.assert_array_equal(one.said.points[0], all_draws.said.points[0])
+    for leaf in jax.tree.leaves((one.said, one.poses)):
+        np.testing.assert_array_equal(leaf[1:], np.zeros_like(leaf[1:]))
+
+
+@pytest.mark.parametrize("num_draws", [1, 3, 7, 11])
+@pytest.mark.parametrize("count", [2, 40, 63, 64, 65, 190, 441, 442, 443, 694, 695, 3000])
+def test_draws_are_full_and_share_but_the_seed_if_they_can(part: PartArrays, num_draws: int, count: int) -> None:
+    room = 63  # beside the seed
+    size = float(part.diameter) / 4
+    grid = np.linspace(-size, size, count, dtype=np.float32)
+    points = np.zeros((4096, 3), dtype=np.float32)
+    points[:count] = np.stack([grid, np.zeros(count), np.full(count, 500)], axis=1)
+    points[[0, count // 2]] = points[[count // 2, 0]]
+    scene = SceneArrays(jnp.asarray(points), jnp.arange(len(points)) < count)
+    config = replace(CONFIG, num_draws=num_draws)
+    crop = jax.jit(crop_for_draws, static_argnums=(3, 4))(part, scene, jax.random.key(0), room + 1, config)
+    draw = jax.jit(draw_of_crop, static_argnums=(3, 4))
+    draws = [draw(crop, number, part.diameter, room + 1, config) for number in range(num_draws)]
+    taken = [np.asarray(one.points[one.mask][:, 0]) for one in draws]
+    for one, values in zip(draws, taken, strict=True):
+        assert values[0] == 0
+        assert len(np.unique(values)) == len(values) == min(count, room + 1)
+        assert np.ptp(values) > (1.8 if count > 2 else 0.9) * size
+        np.testing.assert_allclose(np.linalg.norm(one.normals, axis=1), one.mask, atol=1e-5)
+    others = np.concatenate([values[1:] for values in taken])
+    if count - 1 >= num_draws * room:
+        assert len(np.unique(others)) == num_draws * room
+    else:
+        assert len(np.unique(others)) <= count - 1
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5, 12])
@@ -100,9 +151,10 @@ def test_crops_of_next_to_nothing_have_no_pose(model: Model, part: PartArrays, c
     assert not found.converged
     np.testing.assert_array_equal(found.T_scene_object, np.eye(4))
     assert found.num_inliers == 0
+    assert found.status != PoseStatus.OK
 
 
-@pytest.mark.parametrize("values", [{"num_draws": 0}, {"num_modes": 0}, {"surface_points": 0}])
+@pytest.mark.parametrize("values", [{"num_draws": 0}, {"num_modes": 0}, {"surface_points": 0}, {"enough": np.nan}])
 def test_settings_without_meaning_are_refused(values: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=next(iter(values))):
         CropPoseConfig(**values)  # type: ignore[arg-type]

@@ -11,16 +11,9 @@ import pytest
 
 from kmn_jax.data.splat import Intrinsics, Surfels
 from kmn_jax.estimator.evidence import EVIDENCE, Sight, evidence_of
-from kmn_jax.estimator.search import (
-    PartArrays,
-    SceneArrays,
-    SearchConfig,
-    crop_features,
-    search,
-    seed_keys,
-    spread_rows,
-    spread_seeds,
-)
+from kmn_jax.estimator.part import PartArrays
+from kmn_jax.estimator.scan_crop import SceneArrays
+from kmn_jax.estimator.search import SearchConfig, crop_features, search, seed_keys, spread_rows, spread_seeds
 from kmn_jax.estimator.verify import VerifyConfig, depth_buffer
 from kmn_jax.models import Model, create_model, encode_object
 from kmn_jax.pose import RansacConfig
