@@ -1,6 +1,9 @@
-"""From points to refined poses by the released network: crops a second at growing batches, and a whole bin in one call.
+"""From points to refined poses by the released network: beside Open3D, at growing batches, and a whole bin in one call.
 
 python -m benchmarks.crops [--batches 1 4 16 64] [--folder DATASET] [--json FILE]
+
+Open3D's FPFH and RANSAC get the same crops; their poses are counted and timed without refinement and with the ICP that
+all methods of an evaluation share, ours with that of the same call.
 
 A crop's stages are one compiled call, a bin's too: depth image in, ranked poses out. Beside a bin's call stands the
 search in rounds of `PoseEstimator.detect`, which refines on more points and compares turned forms of each pose.
@@ -9,6 +12,7 @@ search in rounds of `PoseEstimator.detect`, which refines on more points and com
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,21 +22,27 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from benchmarks.stages import REFINED, small_case
+from benchmarks.network_cases import each
+from benchmarks.stages import REFINED, small_crop
 from benchmarks.timing import compile_for, time_in_turn
-from experiments.bins import THRESHOLD, BinImage, bin_images
-from experiments.evaluation.methods import padded
+from experiments.bins import LEAST_VISIBLE, THRESHOLD, BinImage, bin_images
+from experiments.evaluation.cases import Case, ObjectImages, Solver, draw_cases
+from experiments.evaluation.methods import Ours, OursConfig
+from experiments.evaluation.refinement import Refinement
+from experiments.evaluation.rivals import missing
+from experiments.evaluation.scores import pair_errors
+from experiments.evaluation.sources import bop_objects
+from experiments.evaluation.tuned import RIVALS
+from kmn_jax.data.cad import ObjectModel
 from kmn_jax.data.splat import intrinsics
 from kmn_jax.estimator import PoseEstimator
 from kmn_jax.estimator.bin_poses import BinPosesConfig, bin_part, bin_poses
-from kmn_jax.estimator.candidates import arrays_of
 from kmn_jax.estimator.crop_pose import crop_pose
 from kmn_jax.estimator.evidence import Sight
-from kmn_jax.estimator.part import make_part
 from kmn_jax.models import Model
 from kmn_jax.report import print_table, write_json
 
-_LEAST_VISIBLE = 0.3
+_RIVAL = "FPFH + RANSAC"
 
 
 def main(
@@ -43,7 +53,7 @@ def main(
     repeats: int = 9,
     json: Path | None = None,
 ) -> None:
-    """Run both tables.
+    """Run all tables.
 
     Args:
         batches: crops at once.
@@ -54,7 +64,9 @@ def main(
         json: where results go.
     """
     estimator = PoseEstimator.from_pretrained()
-    crops = [crop_row(estimator.model, batch, repeats) for batch in batches]
+    same = [row for found in bop_objects(folder, "test", print) for row in same_crops(estimator.model, found, repeats)]
+    print_table("the same crops, 1% noise, one after another", same)
+    crops = [crop_row(batch, repeats) for batch in batches]
     print_table("crops to refined poses, `small`", crops)
     config = BinPosesConfig(num_seeds=seeds)
     images = bin_images(folder, "test", estimator.model, every)
@@ -62,13 +74,63 @@ def main(
     print_table("whole bins", bins)
     totals = {key: sum(row[key] for row in bins) for key in ("visible", *_counted("call"), *_counted("rounds"))}
     print_table("all bins: poses, right ones, and visible copies that were found", [totals])
-    write_json(json, {"crops": crops, "bins": bins, "totals": totals})
+    write_json(json, {"same crops": same, "crops": crops, "bins": bins, "totals": totals})
 
 
-def crop_row(model: Model, batch: int, repeats: int) -> dict[str, Any]:
+def same_crops(model: Model, found: ObjectImages, repeats: int, count: int = 12) -> list[dict[str, Any]]:
+    """Time ours, refined, and Open3D's FPFH and RANSAC, on crops of an object; count what each finds."""
+    cases = list(draw_cases(found, count, 0.01))
+    if not cases:
+        return []
+    solvers = {"ours, refined": Ours("ours", model, OursConfig(REFINED)).prepare(found.model)}
+    module, make = RIVALS["fpfh"]
+    if (reason := missing(module)) is None:
+        solve = make().prepare(found.model)
+        solvers |= {_RIVAL: solve, f"{_RIVAL} + ICP": _with(solve, Refinement(found.model))}
+    else:
+        print(f"skipped {_RIVAL}: {reason}")
+    calls = {name: partial(_solved, solve, cases) for name, solve in solvers.items()}
+    times = time_in_turn(calls, repeats)
+    rows = []
+    for name, call in calls.items():
+        right = [
+            pose is not None and _error(pose, case, found.model) < THRESHOLD
+            for pose, case in zip(call(), cases, strict=True)
+        ]
+        rows.append(
+            {
+                "object": found.name,
+                "method": name,
+                "crops": len(cases),
+                "right": sum(right),
+                "ms a crop": times[name].median_ms / len(cases),
+                f"x {_RIVAL}": times[_RIVAL].median_ms / times[name].median_ms if reason is None else None,
+            }
+        )
+    return rows
+
+
+def _with(solve: Solver, refine: Refinement) -> Solver:
+    def refined(case: Case) -> np.ndarray | None:
+        pose = solve(case)
+        return None if pose is None else refine(case, pose)
+
+    return refined
+
+
+def _solved(solve: Solver, cases: Sequence[Case]) -> list[np.ndarray | None]:
+    return [solve(case) for case in cases]
+
+
+def _error(pose: np.ndarray, case: Case, model: ObjectModel) -> float:
+    """Return the ADI to the nearest copy, in diameters."""
+    pairs = np.stack([np.broadcast_to(pose, case.T_camera_object.shape), case.T_camera_object], axis=1)
+    return float(pair_errors(pairs, model).min())
+
+
+def crop_row(batch: int, repeats: int) -> dict[str, Any]:
     """Time the same crop, many times at once, each with draws of its own."""
-    found, case = small_case()
-    part, scene = arrays_of(model, make_part(found, model)), padded(case.points)
+    model, part, scene = small_crop()
     count = model.config.num_scene_points
     keys = jax.random.split(jax.random.key(0), batch)
     scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (batch, *leaf.shape)), scene)
@@ -78,9 +140,7 @@ def crop_row(model: Model, batch: int, repeats: int) -> dict[str, Any]:
             scene, key = item
             return crop_pose(model.graphdef, parameters, part, scene, key, count, REFINED)
 
-        # CPUs have no use for a batch: one crop fills the cores.
-        on_cpu = jax.default_backend() == "cpu"
-        return jax.lax.map(one, (scenes, keys)) if on_cpu else jax.vmap(lambda s, k: one((s, k)))(scenes, keys)
+        return each(one, (scenes, keys))
 
     ready = compile_for(solve, model.parameters, part, scenes, keys)
     call = partial(ready.function, model.parameters, part, scenes, keys)
@@ -101,7 +161,7 @@ def bin_row(estimator: PoseEstimator, image: BinImage, config: BinPosesConfig, r
     model, view = estimator.model, image.scene.view
     part = bin_part(model, image.part, estimator.probabilities.found, config)
     sight = Sight(jnp.asarray(view.depth), intrinsics(view.camera))
-    inside, key = jnp.asarray(_foreground(image)), jax.random.key(0)
+    inside, key = jnp.asarray(image.inside), jax.random.key(0)
     call = partial(bin_poses, *model, part, sight, inside, key, num_points=model.config.num_scene_points, config=config)
     found = jax.device_get(call())
     with jax.transfer_guard("disallow"):
@@ -117,7 +177,7 @@ def bin_row(estimator: PoseEstimator, image: BinImage, config: BinPosesConfig, r
     return {
         "part": image.part.name,
         "copies": len(image.truth),
-        "visible": int((image.visible >= _LEAST_VISIBLE).sum()),
+        "visible": int((image.visible >= LEAST_VISIBLE).sum()),
         "call ms": times.median_ms,
         **_tally("call", image, poses),
         "rounds ms": 1e3 * seconds,
@@ -134,18 +194,8 @@ def _tally(of: str, image: BinImage, poses: np.ndarray) -> dict[str, int]:
     if not len(poses):
         return dict.fromkeys(_counted(of), 0)
     right = image.errors(poses) < THRESHOLD
-    counts = len(poses), right.any(axis=1).sum(), (right.any(axis=0) & (image.visible >= _LEAST_VISIBLE)).sum()
+    counts = len(poses), right.any(axis=1).sum(), (right.any(axis=0) & (image.visible >= LEAST_VISIBLE)).sum()
     return dict(zip(_counted(of), map(int, counts), strict=True))
-
-
-def _foreground(image: BinImage) -> np.ndarray:
-    """Return the pixels whose points lie inside of the bin, as far as the scene kept them."""
-    view, camera = image.scene.view, image.scene.view.camera
-    x, y, z = image.scene.points[image.scene.foreground].T
-    flags = np.zeros(view.depth.shape, dtype=bool)
-    row, column = np.rint(y / z * camera.fy + camera.cy), np.rint(x / z * camera.fx + camera.cx)
-    flags[row.astype(int), column.astype(int)] = True
-    return flags
 
 
 if __name__ == "__main__":

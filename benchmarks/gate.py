@@ -11,6 +11,7 @@ from __future__ import annotations
 import json as json_format
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,16 +21,20 @@ import jax.numpy as jnp
 import tyro
 from flax import nnx
 
-from benchmarks.network_cases import Case, dense_jax_forward, make_case
-from benchmarks.stages import REFINED, small_case
+from benchmarks.network_cases import (
+    Case,
+    cached_forward,
+    dense_jax_forward,
+    encode_objects,
+    head_features,
+    make_case,
+    match,
+)
+from benchmarks.stages import REFINED, small_crop
 from benchmarks.timing import compile_for, time_in_turn
-from experiments.evaluation.methods import padded
 from kmn_jax.checks import InputError
-from kmn_jax.estimator.candidates import arrays_of
 from kmn_jax.estimator.crop_pose import crop_pose
-from kmn_jax.estimator.part import make_part
 from kmn_jax.geometry.knn import k_nearest, squared_distances
-from kmn_jax.models import load_pretrained
 from kmn_jax.models.normalization import released_object, released_scene
 from kmn_jax.report import print_table, write_json
 from tests.reference import dense_jax
@@ -90,15 +95,10 @@ def compared(ratios: dict[str, float], baseline: dict[str, float]) -> tuple[list
 
 def network_pair(case: Case) -> Pair:
     """The scene branch and the pair head, beside all branches: the dense form caches nothing."""
-    graphdef, length = case.model.graphdef, jnp.float32(1)
-
-    def cached(parameters: nnx.State, crop: jax.Array, part: jax.Array) -> Any:
-        network = nnx.merge(graphdef, parameters)
-        return network.match(network.encode_scene(crop, length), part)
-
-    part = nnx.merge(graphdef, case.parameters).encode_object(case.clouds[0], case.keypoint_indices, length)
+    graphdef = case.model.graphdef
+    parts = encode_objects(graphdef, case.parameters, case)
     return Pair(
-        _ready(cached, case.parameters, case.crops[0], part),
+        _ready(partial(cached_forward, graphdef), case.parameters, case.crops, parts),
         _ready(dense_jax_forward, case),
     )
 
@@ -128,12 +128,10 @@ def gradient_pair(case: Case) -> Pair:
 
 def head_pair(case: Case) -> Pair:
     """The pair head on drawn features."""
-    scene = jax.random.normal(jax.random.key(0), (2048, 512))
-    part = jax.random.normal(jax.random.key(1), (20, 128))
-    graphdef = case.model.graphdef
+    features = head_features()
     return Pair(
-        _ready(lambda p, s, o: nnx.merge(graphdef, p).match(s, o), case.parameters, scene, part),
-        _ready(dense_jax.match, scene, part, nnx.to_pure_dict(case.parameters)),
+        _ready(partial(match, case.model.graphdef), case.parameters, *features),
+        _ready(dense_jax.match, *features, nnx.to_pure_dict(case.parameters)),
     )
 
 
@@ -148,14 +146,13 @@ def neighbor_pair(width: int) -> Pair:
 def pose_pair(case: Case) -> Pair:
     """The released network from a crop to the refined pose, beside one dense forward of the published network.
 
-    Not the same result, but both take the same time on every run, which a rival's RANSAC does not.
+    With all draws, so that its work is the same for any key. Not the same result, but both take the same time on every
+    run, which a rival's RANSAC does not.
     """
-    model = load_pretrained("small")
-    found, crop = small_case()
-    arrays = arrays_of(model, make_part(found, model))
-    scene, key = padded(crop.points), jax.random.key(0)
-    count = model.config.num_scene_points
-    return Pair(lambda: crop_pose(*model, arrays, scene, key, count, REFINED), _ready(dense_jax_forward, case))
+    model, part, scene = small_crop()
+    key, count = jax.random.key(0), model.config.num_scene_points
+    config = replace(REFINED, enough=None)
+    return Pair(lambda: crop_pose(*model, part, scene, key, count, config), _ready(dense_jax_forward, case))
 
 
 def _ready(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:

@@ -17,10 +17,20 @@ import tyro
 from flax import nnx
 
 from benchmarks.memory import peak_of_each
-from benchmarks.network_cases import Case, dense_jax_forward, make_case, torch_forward
+from benchmarks.network_cases import (
+    Case,
+    cached_forward,
+    dense_jax_forward,
+    encode_objects,
+    head_features,
+    make_case,
+    match,
+    torch_forward,
+)
 from benchmarks.timing import Compiled, compile_for, time_in_turn
 from kmn_jax.models.layers import Compute
 from kmn_jax.report import print_table, write_json
+from tests.reference import dense_jax
 
 
 def main(
@@ -57,9 +67,9 @@ def forward_rows(batch: int, repeats: int, dense: bool) -> list[dict[str, Any]]:
     compiled: dict[str, tuple[Compiled, tuple[Any, ...]]] = {}
     for compute in arithmetic:
         model = case.with_compute(compute)
-        parts = jax.jit(partial(_encode_objects, model.graphdef))(model.parameters, case)
+        parts = jax.jit(partial(encode_objects, model.graphdef))(model.parameters, case)
         compiled[f"ours, cached object, {compute}"] = (
-            compile_for(partial(_cached, model.graphdef), model.parameters, case.crops, parts),
+            compile_for(partial(cached_forward, model.graphdef), model.parameters, case.crops, parts),
             (model.parameters, case.crops, parts),
         )
     compiled["ours, object encoded too"] = (
@@ -102,12 +112,8 @@ def pair_head_rows(repeats: int) -> list[dict[str, Any]]:
     """Time the separated pair head beside its dense JAX form, on the same features."""
     case = make_case(1)
     parameters = nnx.to_pure_dict(case.parameters)
-    scene = jax.random.normal(jax.random.key(0), (2048, 512))
-    part = jax.random.normal(jax.random.key(1), (20, 128))
-    graphdef = case.model.graphdef
-    from tests.reference import dense_jax
-
-    ours = compile_for(lambda p, s, o: nnx.merge(graphdef, p).match(s, o), case.parameters, scene, part)
+    scene, part = head_features()
+    ours = compile_for(partial(match, case.model.graphdef), case.parameters, scene, part)
     dense = compile_for(dense_jax.match, scene, part, parameters)
     calls = {
         "ours": lambda: ours.function(case.parameters, scene, part),
@@ -137,28 +143,8 @@ def memory_rows() -> list[dict[str, Any]]:
     ]
 
 
-def _encode_objects(graphdef: nnx.GraphDef, parameters: nnx.State, case: Case) -> jax.Array:
-    network = nnx.merge(graphdef, parameters)
-    return _each(lambda cloud: network.encode_object(cloud, case.keypoint_indices, case.length), case.clouds)
-
-
-def _cached(graphdef: nnx.GraphDef, parameters: nnx.State, crops: jax.Array, parts: jax.Array) -> Any:
-    network = nnx.merge(graphdef, parameters)
-    length = jnp.float32(1)
-
-    def one(pair: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        return network.match(network.encode_scene(pair[0], length), pair[1])
-
-    return _each(one, (crops, parts))
-
-
-def _each(function: Callable[[Any], Any], batch: Any) -> Any:
-    """Batch by vmap; on CPUs one after the other, as one crop fills the cores and many only outgrow the caches."""
-    return jax.lax.map(function, batch) if jax.default_backend() == "cpu" else jax.vmap(function)(batch)
-
-
 def _whole(graphdef: nnx.GraphDef, parameters: nnx.State, case: Case) -> Any:
-    return _cached(graphdef, parameters, case.crops, _encode_objects(graphdef, parameters, case))
+    return cached_forward(graphdef, parameters, case.crops, encode_objects(graphdef, parameters, case))
 
 
 def _share_within(outputs: list[np.ndarray], reference: list[np.ndarray]) -> float:

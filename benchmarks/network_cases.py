@@ -1,4 +1,4 @@
-"""The inputs, weights and rivals that the network benchmarks share."""
+"""The inputs, weights, calls and rivals that the network benchmarks share."""
 
 from __future__ import annotations
 
@@ -57,6 +57,37 @@ def make_case(batch: int) -> Case:
     flat = {path: draw(path, value) for path, value in nnx.to_flat_state(model.parameters)}
     indices = jnp.asarray(rng.permutation(2048)[:20])
     return Case(nnx.from_flat_state(flat), clouds[0], clouds[1], indices, jnp.float32(1))
+
+
+def each(function: Callable[[Any], Any], batch: Any) -> Any:
+    """Batch by vmap; on CPUs one after the other, as one crop fills the cores and many only outgrow the caches."""
+    return jax.lax.map(function, batch) if jax.default_backend() == "cpu" else jax.vmap(function)(batch)
+
+
+def encode_objects(graphdef: nnx.GraphDef, parameters: nnx.State, case: Case) -> jax.Array:
+    """Return the keypoints' features of a case's objects (b, 20, 128)."""
+    network = nnx.merge(graphdef, parameters)
+    return each(lambda cloud: network.encode_object(cloud, case.keypoint_indices, case.length), case.clouds)
+
+
+def cached_forward(graphdef: nnx.GraphDef, parameters: nnx.State, crops: jax.Array, parts: jax.Array) -> Any:
+    """Return both logits of crops (b, n, 6), each with an object that is encoded already."""
+    network = nnx.merge(graphdef, parameters)
+
+    def one(pair: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        return network.match(network.encode_scene(pair[0], jnp.float32(1)), pair[1])
+
+    return each(one, (crops, parts))
+
+
+def head_features(keypoints: int = 20) -> tuple[jax.Array, jax.Array]:
+    """Return drawn features of 2048 points and of an object's keypoints, for the pair head alone."""
+    return jax.random.normal(jax.random.key(0), (2048, 512)), jax.random.normal(jax.random.key(1), (keypoints, 128))
+
+
+def match(graphdef: nnx.GraphDef, parameters: nnx.State, scene: jax.Array, part: jax.Array) -> Any:
+    """Return both logits of features."""
+    return nnx.merge(graphdef, parameters).match(scene, part)
 
 
 def dense_jax_forward(case: Case) -> tuple[jax.Array, jax.Array]:

@@ -19,7 +19,7 @@ import tyro
 from benchmarks.network_cases import make_case
 from benchmarks.stages import Stage, network_stages, pose_stages, training_stages
 from benchmarks.timing import Ceilings, measure_ceilings, time_in_turn
-from benchmarks.work import Work
+from benchmarks.work import Work, total
 from kmn_jax.report import print_table, write_json
 
 # Measured on such a machine: 8192 x 8192 bfloat16 products of random data, and device-to-device copies. The first, of
@@ -57,9 +57,8 @@ def roofline_rows(stages: Mapping[str, Stage], ceilings: Ceilings, repeats: int,
     times = time_in_turn({name: stage.call for name, stage in stages.items()}, repeats)
     rows = [_row(name, times[name].median_ms, stage.work, ceilings) for name, stage in stages.items()]
     if summed:
-        works = [stage.work for stage in stages.values()]
-        total = sum(works[1:], start=works[0])
-        row = _row("sum of the stages", sum(row["ms"] for row in rows), total, ceilings)
+        together = total(stage.work for stage in stages.values())
+        row = _row("sum of the stages", sum(row["ms"] for row in rows), together, ceilings)
         for column in ("floor ms", "H200 floor us"):  # one after the other, each at its own limit
             row[column] = sum(row[column] for row in rows)
         rows.append(row | {"x floor": row["ms"] / row["floor ms"], "bound": None})

@@ -10,28 +10,24 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 from flax import nnx
 from jaxtyping import Float
 
-from benchmarks.network_cases import make_case
-from benchmarks.stages import small_case
+from benchmarks.network_cases import cached_forward, encode_objects, head_features, make_case, match
+from benchmarks.stages import small_case, small_crop
 from benchmarks.synthetic import synthetic_matches
 from benchmarks.timing import Compiled, compile_for, time_in_turn
 from benchmarks.training import of_batch, throughput_rows
 from configs import find_config
-from experiments.evaluation.methods import padded
 from experiments.evaluation.plots import as_png, new_figure
-from kmn_jax.estimator.candidates import arrays_of
-from kmn_jax.estimator.part import make_part, save_part
+from kmn_jax.estimator.part import arrays_of, make_part, save_part
 from kmn_jax.estimator.search import SearchConfig, crop_features, search, seed_keys, spread_seeds
 from kmn_jax.models import load_pretrained
 from kmn_jax.pose import RansacConfig, ransac
@@ -126,45 +122,24 @@ def fitted(sizes: Sequence[int], ms: Sequence[float]) -> Growth:
 def point_sweep() -> Sweep:
     """The published network with a cached object, over the points of a crop."""
     case = make_case(1)
-    graphdef, length = case.model.graphdef, jnp.float32(1)
-    part = nnx.merge(graphdef, case.parameters).encode_object(case.clouds[0], case.keypoint_indices, length)
-
-    def cached(parameters: nnx.State, crop: jax.Array, part: jax.Array) -> Any:
-        network = nnx.merge(graphdef, parameters)
-        return network.match(network.encode_scene(crop, length), part)
-
-    sizes = (256, 512, 1024, 2048)
-    return _sweep("network", "points", cached, {n: (case.parameters, case.crops[0, :n], part) for n in sizes})
+    parts = encode_objects(case.model.graphdef, case.parameters, case)
+    cases = {n: (case.parameters, case.crops[:, :n], parts) for n in (256, 512, 1024, 2048)}
+    return _sweep("network", "points", partial(cached_forward, case.model.graphdef), cases)
 
 
 def keypoint_sweep() -> Sweep:
     """The pair head over keypoints."""
     case = make_case(1)
-    graphdef = case.model.graphdef
-    scene = jax.random.normal(jax.random.key(0), (2048, 512))
-
-    def match(parameters: nnx.State, scene: jax.Array, part: jax.Array) -> Any:
-        return nnx.merge(graphdef, parameters).match(scene, part)
-
-    parts = {count: jax.random.normal(jax.random.key(1), (count, 128)) for count in (5, 20, 80, 320)}
-    return _sweep("pair head", "keypoints", match, {k: (case.parameters, scene, part) for k, part in parts.items()})
+    cases = {count: (case.parameters, *head_features(count)) for count in (5, 20, 80, 320)}
+    return _sweep("pair head", "keypoints", partial(match, case.model.graphdef), cases)
 
 
 def batch_sweep() -> Sweep:
     """The published network with a cached object, over crops at once."""
     case = make_case(16)
-    graphdef, length = case.model.graphdef, jnp.float32(1)
-    part = nnx.merge(graphdef, case.parameters).encode_object(case.clouds[0], case.keypoint_indices, length)
-
-    def many(parameters: nnx.State, crops: jax.Array, part: jax.Array) -> Any:
-        network = nnx.merge(graphdef, parameters)
-
-        def one(crop: jax.Array) -> Any:
-            return network.match(network.encode_scene(crop, length), part)
-
-        return jax.lax.map(one, crops) if jax.default_backend() == "cpu" else jax.vmap(one)(crops)
-
-    return _sweep("network", "crops", many, {n: (case.parameters, case.crops[:n], part) for n in (1, 2, 4, 8, 16)})
+    parts = encode_objects(case.model.graphdef, case.parameters, case)
+    cases = {n: (case.parameters, case.crops[:n], parts[:n]) for n in (1, 2, 4, 8, 16)}
+    return _sweep("network", "crops", partial(cached_forward, case.model.graphdef), cases)
 
 
 def hypothesis_sweep() -> Sweep:
@@ -180,9 +155,8 @@ def hypothesis_sweep() -> Sweep:
 
 def seed_sweep() -> Sweep:
     """Crops of one scan, from points to refined poses, over their number."""
-    model = load_pretrained("small")
-    found, case = small_case()
-    part, scene, config = arrays_of(model, make_part(found, model)), padded(case.points), SearchConfig()
+    model, part, scene = small_crop()
+    config = SearchConfig()
 
     def poses(parameters: nnx.State, part: Any, scene: Any, keys: Any) -> Any:
         count = len(keys[0])
@@ -207,7 +181,7 @@ def seed_sweep() -> Sweep:
 def device_rows(repeats: int) -> list[dict[str, Any]]:
     """Time a training step of `small` on each number of devices."""
     on_cpu = jax.default_backend() == "cpu"
-    config = of_batch(replace(find_config("small")), 16, on_cpu)
+    config = of_batch(find_config("small"), 16, on_cpu)
     counts = [count for count in (1, 2, 4, 8) if count <= len(jax.devices())]
     return [row for count in counts for row in throughput_rows(config, count, repeats)]
 

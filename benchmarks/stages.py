@@ -17,25 +17,26 @@ from benchmarks.timing import compile_for
 from benchmarks.work import Work
 from configs import find_config
 from experiments.evaluation.cases import Case as PoseCase
-from experiments.evaluation.cases import draw_cases
-from experiments.evaluation.methods import padded
+from experiments.evaluation.cases import draw_cases, padded
 from experiments.evaluation.sources import bop_objects
 from kmn_jax.checks import InputError
 from kmn_jax.data.cad import ObjectModel
-from kmn_jax.estimator.candidates import arrays_of
 from kmn_jax.estimator.crop_pose import (
     CropPoseConfig,
     Said,
     crop_for_draws,
     crop_pose,
-    poses_of_draws,
+    draw_of_crop,
+    poses_of_draw,
     refined,
-    said_of_draws,
+    said_of_draw,
+    search_draws,
     surface_scores,
 )
-from kmn_jax.estimator.part import make_part
+from kmn_jax.estimator.part import PartArrays, arrays_of, make_part
+from kmn_jax.estimator.scan_crop import SceneArrays
 from kmn_jax.geometry.knn import k_nearest
-from kmn_jax.models import load_pretrained
+from kmn_jax.models import Model, load_pretrained
 from kmn_jax.pose import IcpConfig
 
 _SMALL_SET = Path("experiments/assets/small_test_set")
@@ -53,6 +54,21 @@ def small_case() -> tuple[ObjectModel, PoseCase]:
     """Return a crop of the small test set, and its object."""
     objects = bop_objects(_SMALL_SET, "test", _refuse, most_images=1)[0]
     return objects.model, next(iter(draw_cases(objects, 1, 0.01)))
+
+
+class SmallCrop(NamedTuple):
+    """The released network, an encoded object, and a crop around a copy of it."""
+
+    model: Model
+    part: PartArrays
+    scene: SceneArrays
+
+
+def small_crop() -> SmallCrop:
+    """Return the crop of `small_case`, as calls take it."""
+    model = load_pretrained("small")
+    found, case = small_case()
+    return SmallCrop(model, arrays_of(model, make_part(found, model)), padded(case.points))
 
 
 def network_stages(case: Case) -> dict[str, Stage]:
@@ -86,52 +102,68 @@ def network_stages(case: Case) -> dict[str, Stage]:
 
 def pose_stages(config: CropPoseConfig = REFINED) -> dict[str, Stage]:
     """Return the stages from a scan to the refined pose by the released network, on a crop of the small test set."""
-    model = load_pretrained("small")
-    found, case = small_case()
-    part, scene = arrays_of(model, make_part(found, model)), padded(case.points)
+    model, part, scene = small_crop()
     key, sizes = jax.random.key(0), model.config
-    count, draws = sizes.num_scene_points, config.num_draws
+    count = sizes.num_scene_points
     if config.icp is None:
         raise InputError("the stages of a crop end with its refinement: give icp")
-    icp = config.icp
+    icp, every = config.icp, replace(config, enough=None)
 
     crop_call = compile_for(lambda p, s, k: crop_for_draws(p, s, k, count, config), part, scene, key).function
     crop = crop_call(part, scene, key)
 
-    def network(parameters: nnx.State, part: Any, crop: Any) -> Said:
-        return said_of_draws(nnx.merge(model.graphdef, parameters), part, crop, config)
+    draw_call = compile_for(lambda c, d: draw_of_crop(c, 0, d, count, config), crop, part.diameter).function
+    drawn = draw_call(crop, part.diameter)
 
-    said_call = compile_for(network, model.parameters, part, crop).function
-    said = said_call(model.parameters, part, crop)
-    poses_call = compile_for(
-        lambda s, v, p, k: poses_of_draws(s, v, p, k, config), said, crop.valid, part, key
-    ).function
-    poses = poses_call(said, crop.valid, part, key)
+    def network(parameters: nnx.State, part: Any, drawn: Any) -> Said:
+        return said_of_draw(nnx.merge(model.graphdef, parameters), part, drawn)
+
+    said_call = compile_for(network, model.parameters, part, drawn).function
+    draw = said_call(model.parameters, part, drawn)
+    poses_call = compile_for(lambda s, v, p, k: poses_of_draw(s, v, p, k, config), draw, crop.valid, part, key).function
+    poses = poses_call(draw, crop.valid, part, key)
+    said = jax.tree.map(lambda leaf: jnp.stack([leaf] * config.num_draws), draw)
     scores_call = compile_for(lambda f, s, c, p: surface_scores(f, s, c, p, config), poses, said, crop.seed, part)
+    searched = jax.jit(lambda c: search_draws(nnx.merge(*model[:2]), part, c, key, count, config))(crop)
+    made = int(searched.num_draws)
     best = int(jnp.argmax(scores_call.function(poses, said, crop.seed, part)))
-    pose, draw = (jax.tree.map(lambda leaf, row=row: leaf[row], of) for of, row in ((poses, best), (said, 0)))
+    pose = jax.tree.map(lambda leaf: leaf[best], poses)
     icp_call = compile_for(lambda f, s, p: refined(f, s, p, icp), pose, draw, part).function
     calls = {
-        "crop and normals": lambda: crop_call(part, scene, key),
-        "network on all draws": lambda: said_call(model.parameters, part, crop),
-        "matches and RANSAC of all draws": lambda: poses_call(said, crop.valid, part, key),
-        "choice by the surface": lambda: scores_call.function(poses, said, crop.seed, part),
+        "crop": lambda: crop_call(part, scene, key),
+        "a draw, smoothed, with normals": lambda: draw_call(crop, part.diameter),
+        "network on a draw": lambda: said_call(model.parameters, part, drawn),
+        "matches and RANSAC of a draw": lambda: poses_call(draw, crop.valid, part, key),
+        "a draw's poses against the surface": lambda: scores_call.function(poses, said, crop.seed, part),
         "ICP": lambda: icp_call(pose, draw, part),
-        "crop to refined pose, one call": lambda: crop_pose(*model, part, scene, key, count, config),
+        "crop to refined pose, all draws": lambda: crop_pose(*model, part, scene, key, count, every),
+        "crop to refined pose": lambda: crop_pose(*model, part, scene, key, count, config),
     }
-    kept = draws * (count - 1) + 1
+    draws, kept = config.num_draws, max(config.num_draws * (count - 1) + 1, config.normal_points)
     pairs = min(config.matches.capacity, count * sizes.num_keypoints)
     search = work.matches(count, sizes.num_keypoints, config.matches) + work.ransac(
         pairs, config.num_modes, config.ransac
     )
     of_stage = {
-        "crop and normals": work.drawn_crop(len(scene.points), max(kept, config.normal_points), kept),
-        "network on all draws": work.total(work.scene_stages(sizes, count)).times(draws),
-        "matches and RANSAC of all draws": search.times(draws),
-        "choice by the surface": work.surface_scores(draws * config.num_modes, config.surface_points, draws * count),
+        "crop": work.drawn_crop(len(scene.points), kept, 0),
+        "a draw, smoothed, with normals": work.drawn_crop(0, kept, count),
+        "network on a draw": work.total(work.scene_stages(sizes, count).values()),
+        "matches and RANSAC of a draw": search,
+        "a draw's poses against the surface": work.surface_scores(
+            config.num_modes, config.surface_points, draws * count
+        ),
         "ICP": work.icp(len(part.points), count, icp),
     }
-    return _joined(calls, of_stage | {"crop to refined pose, one call": work.total(of_stage)})
+    first, *of_draw, last = of_stage.values()
+    draw_work = work.total(of_draw)
+    return _joined(
+        calls,
+        of_stage
+        | {
+            "crop to refined pose, all draws": first + draw_work.times(draws) + last,
+            "crop to refined pose": first + draw_work.times(made) + last,
+        },
+    )
 
 
 def training_stages(names: tuple[str, ...], on_cpu: bool) -> dict[str, Stage]:

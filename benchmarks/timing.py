@@ -97,9 +97,10 @@ class Ceilings:
     matmul_bfloat16_flops: float  # FLOP/s
     copy_bytes: float  # bytes read plus bytes written, per second
 
-    def floor_ms(self, flops: float, transferred: float) -> float:
-        """Return the larger of arithmetic time (float32) and memory time."""
-        return 1e3 * max(flops / self.matmul_flops, transferred / self.copy_bytes)
+    def floor_ms(self, flops: float, transferred: float, low_precision: bool = False) -> float:
+        """Return the larger of arithmetic time, in float32 or bfloat16, and memory time."""
+        rate = self.matmul_bfloat16_flops if low_precision else self.matmul_flops
+        return 1e3 * max(flops / rate, transferred / self.copy_bytes)
 
 
 def measure_ceilings() -> Ceilings:

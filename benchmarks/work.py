@@ -7,6 +7,7 @@ of them before any can go on.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from benchmarks.timing import Ceilings
@@ -43,8 +44,7 @@ class Work(NamedTuple):
 
     def floor_ms(self, ceilings: Ceilings, low_precision: bool = False) -> float:
         """Return the larger of the time to compute and to move; products in bfloat16 if low precision will do."""
-        rate = ceilings.matmul_bfloat16_flops if low_precision and self.matrix else ceilings.matmul_flops
-        return 1e3 * max(self.flops / rate, self.moved / ceilings.copy_bytes)
+        return ceilings.floor_ms(self.flops, self.moved, low_precision and self.matrix)
 
     def bound(self, ceilings: Ceilings) -> str:
         """Return which of the two it is, in float32."""
@@ -117,9 +117,9 @@ def object_work(config: KeyMatchNetConfig) -> Work:
     return work + global_layers(keypoints, 3 * width, config.embedding_width, config.object_width)
 
 
-def total(stages: dict[str, Work]) -> Work:
+def total(works: Iterable[Work]) -> Work:
     """All stages, one after the other."""
-    first, *rest = stages.values()
+    first, *rest = works
     return sum(rest, start=first)
 
 
@@ -159,5 +159,5 @@ def icp(part: int, points: int, config: IcpConfig) -> Work:
 
 def training_step(config: KeyMatchNetConfig, batch: int, crops_per_object: int) -> Work:
     """Forward and backward, which is twice the forward; weights are few. Making the samples is not in it."""
-    forward = total(scene_stages(config, config.num_scene_points))
+    forward = total(scene_stages(config, config.num_scene_points).values())
     return (forward + object_work(config).times(1 / crops_per_object)).times(3 * batch)
