@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from experiments.evaluate import Options, compare, released_or_own, run
-from experiments.evaluation.methods import Method, Ours, OursConfig
+from experiments.evaluation.cases import Method
+from experiments.evaluation.methods import Ours, OursConfig
 from kmn_jax.estimator.crop_pose import CropPoseConfig
 from kmn_jax.models import Model
 
@@ -45,6 +46,8 @@ VARIANTS = {
     "1024 points": OursConfig(num_points=1024),
     "one draw": _pose(num_draws=1),
     "two draws": _pose(num_draws=2),
+    "four draws in any case": _pose(enough=None),
+    "enough at 1": _pose(enough=1.0),
     "one pose a draw": _pose(num_modes=1),
     "eight poses a draw": _pose(num_modes=8),
     "no smoothing": _pose(smooth=None),

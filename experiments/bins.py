@@ -28,6 +28,7 @@ _UNIT = "mm"
 _MOST_POINTS = 131_072
 _POINTS = 1000  # of an object's surface, for errors
 THRESHOLD = 0.1  # of the diameter: a pose with less ADI is right
+LEAST_VISIBLE = 0.3  # share of a copy that is seen, from which on it ought to be found
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class BinImage:
     key: FrameKey
     part: Part
     scene: Scene  # its foreground is what lies inside of the bin
+    inside: Bool[np.ndarray, "h w"]  # the pixels that are measured inside of the bin
     truth: Float[np.ndarray, "i 4 4"]
     visible: Float[np.ndarray, " i"]  # share of each copy that is seen
     stranger: Part | None = None  # a part of about the same size of which there is no copy
@@ -74,10 +76,12 @@ def bin_images(folder: Path, split: str, model: Model, every: int = 1) -> Iterat
             raise InputError(f"{folder}: image {key.image_id} of scene {key.scene_id} has no poses or no bin")
         object_id = instances[0].object_id
         part = parts[object_id]
+        inside = _inside(frame, frame.bin, frame.T_camera_bin, part)
         yield BinImage(
             key,
             part,
-            make_scene(_view(frame), _UNIT, _inside(frame, frame.bin, frame.T_camera_bin, part), _MOST_POINTS),
+            make_scene(_view(frame), _UNIT, inside[frame.depth > 0], _MOST_POINTS),
+            inside,
             np.stack([instance.T_camera_object for instance in instances]),
             np.array([instance.visible_fraction or 0.0 for instance in instances]),
             min(
@@ -93,8 +97,8 @@ def _view(frame: BopFrame) -> View:
     return view_of(Scan(measured_points(depth, frame.camera), None, depth, frame.camera, _UNIT))
 
 
-def _inside(frame: BopFrame, bin: Bin, T_camera_bin: Float[np.ndarray, "4 4"], part: Part) -> Bool[np.ndarray, " n"]:
-    """Return which measured points lie inside of the bin; all if none does."""
-    content = np.asarray(bin_content(frame.depth, frame.camera, T_camera_bin, bin, part.diameter))
-    inside = content[frame.depth > 0]
-    return inside if inside.any() else np.ones_like(inside)
+def _inside(frame: BopFrame, bin: Bin, T_camera_bin: Float[np.ndarray, "4 4"], part: Part) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels whose measured points lie inside of the bin; all measured ones if none does."""
+    measured = frame.depth > 0
+    inside = np.asarray(bin_content(frame.depth, frame.camera, T_camera_bin, bin, part.diameter)) & measured
+    return inside if inside.any() else measured

@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from experiments.bins import THRESHOLD, BinImage, bin_images
+from experiments.bins import LEAST_VISIBLE, THRESHOLD, BinImage, bin_images
 from experiments.calibrate import SHIPPED
 from experiments.fpfh import fpfh_poses
 from experiments.reliability_picture import save_reliability
@@ -33,7 +33,6 @@ from kmn_jax.estimator.result import Detections
 from kmn_jax.models import load_model, load_pretrained
 from kmn_jax.report import check_target, print_table, write_json
 
-LEAST_VISIBLE = 0.3
 METHODS: dict[str, tuple[Solver | None, DetectConfig]] = {
     "kmn_jax": (None, DetectConfig()),
     "kmn_jax, thorough": (None, THOROUGH),

@@ -18,10 +18,11 @@ from typing import Annotated, Any
 
 import tyro
 
-from experiments.evaluation.cases import ObjectImages, limited
+from experiments.evaluation.cases import Method, ObjectImages, limited
 from experiments.evaluation.configs import CONFIGS, OWN_NETWORKS, EvaluateConfig, find_config
-from experiments.evaluation.methods import ONE_RANSAC, Method, Ours, OursConfig, OwnNetworks
-from experiments.evaluation.predictions import Export, check_files, code_digest, export, library_versions, rivals_digest
+from experiments.evaluation.digests import library_versions, our_code, rivals_code, shared_code
+from experiments.evaluation.methods import ONE_RANSAC, Ours, OursConfig, OwnNetworks
+from experiments.evaluation.predictions import Export, check_files, export
 from experiments.evaluation.refinement import SETTINGS
 from experiments.evaluation.report import Result, draw_pictures, write_report
 from experiments.evaluation.rivals import OverMatches, missing
@@ -41,7 +42,8 @@ from kmn_jax.pose import RansacConfig
 from kmn_jax.report import environment, processor
 
 _CAD_RECORD = ".cad.json"  # of which files bins were made; hidden, so that digests pass over it
-_ELSEWHERE = ("name", "methods", "cad", "cad_names")  # fields that the rest of the recipe tells, or that decide nothing
+# Fields that the rest of the recipe tells, or that decide nothing.
+_ELSEWHERE = ("name", "methods", "weights", "cad", "cad_names")
 
 
 @dataclass(frozen=True)
@@ -76,8 +78,7 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
     recipe = {
         "config": {key: value for key, value in asdict(config).items() if key not in _ELSEWHERE},
         "data": _data_digest(config),
-        "weights": model_digest(model),
-        "code": code_digest(),
+        "code": shared_code(),
         "versions": library_versions(),
         "methods": {key: _settings(method) for key, method in methods.items()},
         "refinement": {key: str(value) for key, value in SETTINGS.items()},
@@ -93,13 +94,17 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
     used = {**exported.recipe, "methods": {key: exported.recipe["methods"][key] for key in methods}}
     units = [(key, found.name, noise) for key in methods for found in objects for noise in config.noise]
     commits = sorted({exported.made_at(*unit) for unit in units})
-    result = Result(config, environment(), used, cells, skipped, tuple(problems), methods, tuple(commits))
+    result = Result(
+        config, environment(), model_digest(model), used, cells, skipped, tuple(problems), methods, tuple(commits)
+    )
     return write_report(folder, result, draw_pictures(result, objects, exported))
 
 
 def _settings(method: Method) -> dict[str, Any]:
     """Return all that decides a method's poses, but for what decides those of all methods."""
-    return {**method.settings, **({"rivals' code": rivals_digest()} if uses_rivals(method) else {})}
+    rivals = {"rivals' code": rivals_code()} if uses_rivals(method) else {}
+    ours = {"our code": our_code()} if isinstance(method, Ours | OwnNetworks) else {}
+    return {**method.settings, **ours, **rivals}
 
 
 def uses_rivals(method: Method) -> bool:

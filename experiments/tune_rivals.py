@@ -6,17 +6,18 @@ On validation bins, never on test sets. Recall and time as in an evaluation, und
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from experiments.evaluate import Options, compare, released_or_own, run
-from experiments.evaluation.methods import ONE_RANSAC, Method, Ours, OursConfig
+from experiments.evaluation.cases import Method
+from experiments.evaluation.methods import ONE_RANSAC, Ours, OursConfig
 from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kiss, OverMatches, PointPairs, missing
 from experiments.evaluation.tuned import RIVALS
 from kmn_jax.models import Model
 
-# Of each rival, voxels without smoothing and with it; finer where the coarse end of a first look was the worse one.
+# Voxels without smoothing and with it; finer where the coarse end of a first look was the worse one.
 _VOXELS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "fpfh": ((0.03, 0.04, 0.05, 0.065), (0.03, 0.04, 0.05, 0.065)),
     "kiss": ((0.015, 0.025), (0.01, 0.015, 0.02)),
@@ -24,41 +25,39 @@ _VOXELS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
 _TUPLES = ((0.025, 1000, 0.95), (0.05, 3000, 0.9))  # of FGR: gate, tuples, their scale; the first are its authors'
 _PAIRS = ((0.1, 0.05, 0.05), (0.07, 0.05, 0.05), (0.07, 0.1, 0.05))  # of PPF: model, scene, share of reference points
 _GATES = (0.06, 0.1, 0.15)  # of Open3D's RANSAC over our matches; the first is the published one
+_SMOOTHED = ("", ", smoothed")  # in titles
 
 
 def methods_of(name: str, model: Model) -> dict[str, Method]:
     """Return a rival with each of the settings."""
-    methods: list[Any] = []
+    methods: Iterable[Method]
     if name == "ours_open3d":
         one = OursConfig(ONE_RANSAC)
         methods = [Ours(f"Open3D RANSAC {gate:g}", model, one, OverMatches(gate=gate)) for gate in _GATES]
-    for smooth in (False, True) if name in RIVALS else ():
-        of_smooth = ", smoothed" if smooth else ""
-        if name == "ppf":
-            methods += [
-                PointPairs(
-                    f"PPF {sampling:g} {voxel:g} {share:g}{of_smooth}",
-                    sampling,
-                    share,
-                    FeatureSettings(voxel=voxel, smooth=smooth),
-                )
-                for sampling, voxel, share in _PAIRS
-            ]
-        elif name == "fgr":
-            features = [FeatureSettings(voxel=voxel) for voxel in (0.02, 0.03)]
-            methods = [
-                FastGlobal(f"FGR {own.voxel:g} {gate:g} {tuples}", own, True, gate, tuples, scale)
-                for own in features
-                for gate, tuples, scale in _TUPLES
-            ]
-            methods.append(FastGlobal("FGR 0.02, gate fixed", features[0], decrease_mu=False))
-        else:
-            methods += [_of_voxel(name, voxel, smooth, of_smooth) for voxel in _VOXELS[name][smooth]]
+    elif name == "ppf":
+        methods = [_point_pairs(*setting, smooth) for smooth in (False, True) for setting in _PAIRS]
+    elif name == "fgr":
+        methods = _fast_global()
+    else:
+        methods = [_of_voxel(name, voxel, smooth) for smooth in (False, True) for voxel in _VOXELS[name][smooth]]
     return {method.name.replace(" ", "_").replace(",", ""): method for method in methods}
 
 
-def _of_voxel(name: str, voxel: float, smooth: bool, of_smooth: str) -> Fpfh | Kiss:
-    title, features = f"{name} {voxel:g}{of_smooth}", FeatureSettings(voxel=voxel, smooth=smooth)
+def _point_pairs(sampling: float, voxel: float, share: float, smooth: bool) -> PointPairs:
+    title = f"PPF {sampling:g} {voxel:g} {share:g}{_SMOOTHED[smooth]}"
+    return PointPairs(title, sampling, share, FeatureSettings(voxel=voxel, smooth=smooth))
+
+
+def _fast_global() -> Iterator[FastGlobal]:
+    features = [FeatureSettings(voxel=voxel) for voxel in (0.02, 0.03)]
+    for own in features:
+        for gate, tuples, scale in _TUPLES:
+            yield FastGlobal(f"FGR {own.voxel:g} {gate:g} {tuples}", own, True, gate, tuples, scale)
+    yield FastGlobal("FGR 0.02, gate fixed", features[0], decrease_mu=False)
+
+
+def _of_voxel(name: str, voxel: float, smooth: bool) -> Fpfh | Kiss:
+    title, features = f"{name} {voxel:g}{_SMOOTHED[smooth]}", FeatureSettings(voxel=voxel, smooth=smooth)
     if name == "fpfh":
         return Fpfh(title, features)
     return Kiss(title, voxel, replace(features, voxel=voxel / 1.5) if smooth else None)

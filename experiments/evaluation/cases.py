@@ -7,21 +7,23 @@ was measured within a diameter of the seed, without the background that is known
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from kmn_jax.checks import InputError
 from kmn_jax.data.cad import ObjectModel
+from kmn_jax.estimator.scan_crop import SceneArrays, padded_points
 
 UNIT = "mm"
 _SEED_DRAWS = 5000  # points of a scan whose copy is looked for
 _LABEL_TOLERANCE = 0.02  # of the diameter: a point belongs to the copy whose surface is so near
 _LEAST_VISIBLE = 0.1  # of a copy, where it is known
 _LEAST_POINTS = 50  # of a crop
+_LEAST_PADDED, _MOST_PADDED = 16_384, 32_768  # of a padded crop; more are thinned out at random
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,28 @@ class Case:
     def random_seed(self) -> int:
         """A number that is the same whenever the case is drawn."""
         return zlib.crc32(self.name.encode())
+
+
+Solver: TypeAlias = Callable[[Case], Float[np.ndarray, "4 4"] | None]
+
+
+class Method(Protocol):
+    """What is compared: prepared once for an object, untimed, it solves case after case.
+
+    It gets what a camera gives: the points of the crop, in the camera's frame, the seed first; and the object's points
+    with their normals.
+    """
+
+    @property
+    def name(self) -> str:
+        """What it is called in tables."""
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """All that decides its poses, for the record."""
+
+    def prepare(self, model: ObjectModel) -> Solver:
+        """Return what solves cases of an object whose lengths are in the cases' unit."""
 
 
 def draw_cases(
@@ -139,3 +163,11 @@ def _owners(
 def limited(objects: Sequence[ObjectImages], names: Sequence[str]) -> list[ObjectImages]:
     """Return the objects of these names; all if none is given."""
     return [found for found in objects if not names or found.name in names]
+
+
+def padded(points: Float32[np.ndarray, "n 3"]) -> SceneArrays:
+    """Return a crop in a capacity of few possible ones, its first point still the first."""
+    if len(points) > _MOST_PADDED:
+        rows = 1 + np.random.default_rng(0).choice(len(points) - 1, _MOST_PADDED - 1, replace=False)
+        points = points[np.concatenate([[0], np.sort(rows)])]
+    return SceneArrays(*padded_points(points, _LEAST_PADDED))

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from experiments.evaluation.cases import Case, ObjectImages, draw_cases
-from experiments.evaluation.configs import EvaluateConfig
+from experiments.evaluation.configs import EvaluateConfig, noise_name
 from experiments.evaluation.pictures import RivalPose, Shown
 from experiments.evaluation.predictions import Export
-from experiments.evaluation.scores import THRESHOLD, Cell, noise_name
+from experiments.evaluation.scores import THRESHOLD, Cell
 
 OURS = "ours"  # the method whose cases are drawn, if it ran
 _BEATEN = 6  # cases, at most, that a rival solves and we do not

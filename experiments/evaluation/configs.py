@@ -40,6 +40,11 @@ METHODS = ("ours", "ours_ransac", "ours_no_normals", "ours_open3d", "fpfh", "fgr
 OWN_NETWORKS = "per_object"  # a method, too, for which networks have to be given
 
 
+def noise_name(noise: float) -> str:
+    """Return what a noise, a share of the object's longest side, is called in tables: "noise 0.4%"."""
+    return f"noise {100 * noise:g}%"
+
+
 @dataclass(frozen=True)
 class EvaluateConfig:
     """What is evaluated."""
@@ -75,7 +80,7 @@ class EvaluateConfig:
         for name in self.methods:
             if name not in (*METHODS, OWN_NETWORKS):
                 raise InputError(f"there is no method {name!r}: there are {', '.join(METHODS)} and {OWN_NETWORKS}")
-        names = {f"{100 * level:g}" for level in self.noise}  # of files and columns, too
+        names = {noise_name(level) for level in self.noise}  # of columns; files are named alike
         if len({*self.methods}) < len(self.methods) or len(names) < len(self.noise):
             raise InputError("a method or a noise is named twice")
         if self.sensor is not None:

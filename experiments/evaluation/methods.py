@@ -1,54 +1,36 @@
-"""Our pose methods on crops, and what a method is.
-
-A method is prepared once for an object, untimed, and then solves case after case. It gets what a camera gives: the
-points of the crop, in the camera's frame, the seed first; and the object's points with their normals.
-"""
+"""Our pose methods on crops."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from typing import Any, Protocol, TypeAlias
+from typing import Any
 
 import jax
 import numpy as np
 from flax import nnx
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
-from experiments.evaluation.cases import Case
+from experiments.evaluation.cases import Case, Solver, padded
 from kmn_jax.checks import InputError
 from kmn_jax.data.cad import ObjectModel
-from kmn_jax.estimator.candidates import arrays_of
-from kmn_jax.estimator.crop_pose import CropPoseConfig, Said, crop_for_draws, crop_pose, matches_of, said_of_draws
-from kmn_jax.estimator.part import Part, make_part, model_digest
+from kmn_jax.estimator.crop_pose import (
+    CropPoseConfig,
+    Said,
+    crop_for_draws,
+    crop_pose,
+    draw_of_crop,
+    matches_of,
+    said_of_draw,
+)
+from kmn_jax.estimator.part import Part, PartArrays, arrays_of, make_part, model_digest
 from kmn_jax.estimator.result import CropPrediction
-from kmn_jax.estimator.search import PartArrays, SceneArrays
-from kmn_jax.estimator.view import padded_points
+from kmn_jax.estimator.scan_crop import SceneArrays
 from kmn_jax.models import Model
 from kmn_jax.models.keymatchnet import model_structure
 from kmn_jax.pose import Matches, RansacConfig
 from kmn_jax.typing import PRNGKey
-
-Solver: TypeAlias = Callable[[Case], Float[np.ndarray, "4 4"] | None]
-
-_LEAST_POINTS, _MOST_POINTS = 16_384, 32_768  # of a padded crop; more are thinned out at random
-
-
-class Method(Protocol):
-    """What is compared."""
-
-    @property
-    def name(self) -> str:
-        """What it is called in tables."""
-
-    @property
-    def settings(self) -> Mapping[str, Any]:
-        """All that decides its poses, for the record."""
-
-    def prepare(self, model: ObjectModel) -> Solver:
-        """Return what solves cases of an object whose lengths are in the cases' unit."""
-
 
 # The published scheme after the same smoothing: one draw of points, one search, and its best pose is taken.
 ONE_RANSAC = CropPoseConfig(num_draws=1, num_modes=1, ransac=RansacConfig())
@@ -74,8 +56,8 @@ class Ours:
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """The network's sizes and those of the search."""
-        own = asdict(self.config)
+        """The network's sizes, its weights' digest, and the sizes of the search."""
+        own = {"weights": model_digest(self.model), **asdict(self.config)}
         if self.search is not None:
             own["search"] = getattr(self.search, "settings", {})
         return {"network": asdict(self.model.config), **own}
@@ -88,7 +70,7 @@ class Ours:
             scene, key = padded(case.points), jax.random.key(case.random_seed)
             if self.search is not None:
                 said, seed = self._said(arrays, scene, key)
-                matches: Matches = jax.device_get(_matches(_first(said), arrays, config.matches))
+                matches: Matches = jax.device_get(_matches(said, arrays, config.matches))
                 pose = self.search(matches, float(model.diameter), case.random_seed)
                 return None if pose is None else _moved(pose, np.asarray(seed))
             network = self.model.graphdef, self.model.parameters
@@ -108,10 +90,9 @@ class Ours:
         """Return what the network says of the first draw of a crop."""
         arrays = arrays_of(self.model, part)
         said, seed = self._said(arrays, padded(case.points), jax.random.key(case.random_seed))
-        first = _first(said)
         points, taken, keypoint, mask = (
             np.asarray(field)
-            for field in (first.points + seed[None], first.on_object, first.logits.argmax(axis=1), first.mask)
+            for field in (said.points + seed[None], said.on_object, said.logits.argmax(axis=1), said.mask)
         )
         return CropPrediction(points[mask], taken[mask], keypoint[mask].astype(np.int32))
 
@@ -144,14 +125,6 @@ class OwnNetworks:
         return Ours(self.name, self.models[model.name], self.config).prepare(model)
 
 
-def padded(points: Float32[np.ndarray, "n 3"]) -> SceneArrays:
-    """Return a crop in a capacity of few possible ones, its first point still the first."""
-    if len(points) > _MOST_POINTS:
-        rows = 1 + np.random.default_rng(0).choice(len(points) - 1, _MOST_POINTS - 1, replace=False)
-        points = points[np.concatenate([[0], np.sort(rows)])]
-    return SceneArrays(*padded_points(points, _LEAST_POINTS))
-
-
 @partial(jax.jit, static_argnames=("graphdef", "config", "num_points"))
 def _said(
     graphdef: nnx.GraphDef,
@@ -162,16 +135,13 @@ def _said(
     num_points: int,
     config: CropPoseConfig,
 ) -> tuple[Said, jax.Array]:
-    """Return what the network says of the draws that `crop_pose` makes with the same key, and the crop's seed."""
+    """Return what the network says of the first draw of `crop_pose` with the same key, and the crop's seed."""
     crop = crop_for_draws(part, scene, key, num_points, config)
-    return said_of_draws(nnx.merge(graphdef, parameters), part, crop, config), crop.seed
+    draw = draw_of_crop(crop, 0, part.diameter, num_points, config)
+    return said_of_draw(nnx.merge(graphdef, parameters), part, draw), crop.seed
 
 
 _matches = jax.jit(matches_of, static_argnames="config")
-
-
-def _first(said: Said) -> Said:
-    return Said(*(field[0] for field in said))
 
 
 def _moved(T_crop_object: np.ndarray, seed: np.ndarray) -> Float[np.ndarray, "4 4"]:

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.evaluation.scores import Cell, noise_name, pooled
+from experiments.evaluation.configs import noise_name
+from experiments.evaluation.scores import Cell, pooled
 from kmn_jax.checks import InputError
 
 

@@ -9,9 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,25 +18,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from safetensors.numpy import save
 
-from experiments.evaluation.cases import Case, ObjectImages, draw_cases
-from experiments.evaluation.methods import Method
+from experiments.evaluation.cases import Case, Method, ObjectImages, draw_cases
 from experiments.evaluation.refinement import Refinement
 from kmn_jax.checks import InputError
 from kmn_jax.files import read_safetensors, write_whole
 from kmn_jax.report import commit
 
-_ROOT = Path(__file__).parents[2]
-_CODE = (
-    *("kmn_jax/geometry", "kmn_jax/models", "kmn_jax/pose", "kmn_jax/data", "experiments/evaluation"),
-    *(f"kmn_jax/estimator/{name}.py" for name in ("candidates", "crop_pose", "search", "part", "view")),
-)
-_LIBRARIES = ("jax", "jaxlib", "numpy", "open3d", "opencv-contrib-python-headless", "kiss-matcher")
-_RIVALS = "rivals.py"
-# Of experiments/evaluation; configs, tuned settings and the code of rivals are in the recipe, for those they concern.
-_NOT_POSES = (
-    *("scores.py", "report.py", "chosen.py", "plots.py", "pictures.py", "published.py"),
-    *("configs.py", "tuned.py", _RIVALS),
-)
 _HEADER = "kmn_jax evaluation 1"
 _OF_METHOD = "method "
 
@@ -221,40 +207,6 @@ def _timed(solve: Callable[[Case], Any], refine: Refinement, case: Case) -> tupl
     refined = nothing if pose is None else refine(case, pose)
     end = time.perf_counter()
     return nothing if pose is None else pose, refined, pose is not None, middle - start, end - middle
-
-
-def code_digest() -> str:
-    """Return the SHA-256 of all code that decides poses, but for that of rivals."""
-    digest = hashlib.sha256()
-    for path in sources():
-        digest.update(path.relative_to(_ROOT).as_posix().encode())
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
-def rivals_digest() -> str:
-    """Return the SHA-256 of the code of rivals, which makes the poses of those alone stale."""
-    return hashlib.sha256((Path(__file__).parent / _RIVALS).read_bytes()).hexdigest()
-
-
-def library_versions() -> dict[str, str | None]:
-    """Return the versions of the libraries that decide poses, None of those that are not there."""
-
-    def found(name: str) -> str | None:
-        try:
-            return version(name)
-        except PackageNotFoundError:
-            return None
-
-    return {name: found(name) for name in _LIBRARIES}
-
-
-def sources() -> Iterator[Path]:
-    """Yield the files of all code that decides poses, but for that of rivals."""
-    for name in _CODE:
-        place = _ROOT / name
-        files = [place] if place.is_file() else sorted(place.rglob("*.py"))
-        yield from (file for file in files if file.name not in _NOT_POSES)
 
 
 def check_files(names: Sequence[str], where: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from experiments.evaluation.scores import noise_name
+from experiments.evaluation.configs import noise_name
 
 SOURCE = "arXiv 2303.16102, on the authors' own parts and scenes: not the same test data"
 

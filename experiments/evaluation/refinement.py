@@ -7,12 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from experiments.evaluation.cases import Case
-from experiments.evaluation.methods import padded
+from experiments.evaluation.cases import Case, padded
 from kmn_jax.data.cad import ObjectModel
 from kmn_jax.data.smoothing import SmoothConfig
-from kmn_jax.estimator.crop_pose import drawn_crop
-from kmn_jax.estimator.search import SceneArrays
+from kmn_jax.estimator.scan_crop import SceneArrays, drawn_crop
 from kmn_jax.pose import IcpConfig, icp
 from kmn_jax.typing import Pose, PRNGKey, Scalar
 

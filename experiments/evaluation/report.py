@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from experiments.evaluation.cases import ObjectImages
+from experiments.evaluation.cases import Method, ObjectImages
 from experiments.evaluation.chosen import OURS, chosen_cases
-from experiments.evaluation.configs import EvaluateConfig
-from experiments.evaluation.methods import Method, Ours
+from experiments.evaluation.configs import EvaluateConfig, noise_name
+from experiments.evaluation.methods import Ours
 from experiments.evaluation.pictures import case_grid
 from experiments.evaluation.plots import recall_plot
 from experiments.evaluation.predictions import Export
 from experiments.evaluation.published import MILLISECONDS, RECALL, SOURCE
-from experiments.evaluation.scores import Cell, noise_name, object_rows, pooled, recall_rows, seed_rows
+from experiments.evaluation.scores import Cell, object_rows, pooled, recall_rows, seed_rows
 from kmn_jax.files import write_whole
 from kmn_jax.report import markdown_table, print_table
 
@@ -41,6 +41,7 @@ class Result:
 
     config: EvaluateConfig
     environment: Mapping[str, Any]
+    weights: str  # digest of the network that our methods use unless they have their own
     recipe: Mapping[str, Any]
     cells: Sequence[Cell]
     skipped: Mapping[str, str]  # why methods could not run
@@ -148,7 +149,7 @@ def _facts(result: Result) -> dict[str, str]:
         "Date": environment["date"],
         "Machine": f"{environment['processor']}, {environment['cores']} cores, {environment['platform']}",
         "Versions": versions,
-        "Weights": f"{result.config.weights}, SHA-256 {str(result.recipe['weights'])[:16]}",
+        "Weights": f"{result.config.weights}, SHA-256 {result.weights[:16]}",
         "Data": f"{result.config.name}, digest {str(result.recipe['data'])[:16]}, seed {result.config.seed}",
     }
 
@@ -224,7 +225,12 @@ def _scores(result: Result) -> dict[str, Any]:
         }
         for cell in result.cells
     ]
-    facts = {"environment": dict(result.environment), "recipe": dict(result.recipe), "poses": list(result.commits)}
+    facts = {
+        "environment": dict(result.environment),
+        "weights": result.weights,
+        "recipe": dict(result.recipe),
+        "poses": list(result.commits),
+    }
     return {**facts, "skipped": dict(result.skipped), "left out": list(result.problems), "cells": cells}
 
 

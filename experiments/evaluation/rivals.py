@@ -17,11 +17,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from experiments.evaluation.cases import Case
-from experiments.evaluation.methods import Solver
+from experiments.evaluation.cases import Case, Solver
 from kmn_jax.data.cad import ObjectModel
 from kmn_jax.data.smoothing import smoothed
-from kmn_jax.estimator.view import padded_points
+from kmn_jax.estimator.scan_crop import padded_points
 from kmn_jax.pose import Matches
 
 _LEAST_POINTS = 10  # of a thinned crop

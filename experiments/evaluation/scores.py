@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from experiments.bins import adi_of_pairs
+from experiments.evaluation.configs import noise_name
 from experiments.evaluation.predictions import Export, Predictions, Truth
 from kmn_jax.data.cad import ObjectModel
 
@@ -58,11 +59,6 @@ def wilson(right: int, total: int) -> tuple[float, float]:
     half = _Z * np.sqrt(share * (1 - share) / total + spread / (4 * total)) / (1 + spread)
     # The share itself is inside, whatever rounding does at 0 and 1.
     return max(min(float(middle - half), share), 0.0), min(max(float(middle + half), share), 1.0)
-
-
-def noise_name(noise: float) -> str:
-    """Return what a noise, a share of the object's longest side, is called in tables: "noise 0.4%"."""
-    return f"noise {100 * noise:g}%"
 
 
 def pooled(cells: Sequence[Cell], name: str) -> Cell:
@@ -114,19 +110,21 @@ def _errors(poses: Float[np.ndarray, "c 4 4"], found: Predictions, truth: Truth,
         of_seed += [copy == seed for copy in near]
     errors, own = np.full(len(poses), np.inf), np.full(len(poses), np.inf)
     if pairs:
-        each, is_own = _adi(np.stack(pairs), model) / model.diameter, np.array(of_seed)
+        each, is_own = pair_errors(np.stack(pairs), model), np.array(of_seed)
         np.minimum.at(errors, rows, each)
         np.minimum.at(own, np.array(rows)[is_own], each[is_own])
     return _Errors(errors, np.isfinite(own) & (own <= errors))
 
 
-def _adi(pairs: Float[np.ndarray, "p 2 4 4"], model: ObjectModel) -> Float[np.ndarray, " p"]:
+def pair_errors(pairs: Float[np.ndarray, "p 2 4 4"], model: ObjectModel) -> Float[np.ndarray, " p"]:
+    """Return the ADI of pairs of poses, the second one the true one, in diameters."""
     capacity = 1 << max(len(pairs) - 1, 0).bit_length()
     origin = pairs[:, :1, :3, 3].copy()  # float32 of millimetres far from the camera would lose digits
     near = pairs.copy()
     near[:, :, :3, 3] -= origin
     padded = np.concatenate([near, np.tile(np.eye(4), (capacity - len(pairs), 2, 1, 1))]).astype(np.float32)
-    return np.asarray(adi_of_pairs(padded, jnp.asarray(model.points[:_POINTS], dtype=jnp.float32)))[: len(pairs)]
+    points = jnp.asarray(model.points[:_POINTS], dtype=jnp.float32)
+    return np.asarray(adi_of_pairs(padded, points))[: len(pairs)] / model.diameter
 
 
 def recall_rows(cells: Sequence[Cell], objects: str) -> list[dict[str, Any]]:

@@ -1,6 +1,6 @@
 """The rivals as they are compared: what found most poses after ICP on validation bins, see `experiments.tune_rivals`.
 
-Point pair features have not been tuned yet; no finer sampling than their default is likely to be, see `PointPairs`.
+The reports of the choice are in experiments/results/tuning.
 
 Apart from `rivals`, so that a setting that changes makes the poses of its own method stale and no others.
 """
@@ -15,7 +15,13 @@ from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kis
 # By the names of the methods: the package that is needed, and what makes the rival.
 RIVALS: Mapping[str, tuple[str, Callable[[], Any]]] = {
     "fpfh": ("open3d", lambda: Fpfh(features=FeatureSettings(voxel=0.05))),
-    "fgr": ("open3d", lambda: FastGlobal(features=FeatureSettings(voxel=0.02))),
-    "ppf": ("cv2.ppf_match_3d", PointPairs),
+    "fgr": (
+        "open3d",
+        lambda: FastGlobal(features=FeatureSettings(voxel=0.02), gate=0.05, tuples=3000, tuple_scale=0.9),
+    ),
+    "ppf": (
+        "cv2.ppf_match_3d",
+        lambda: PointPairs(scene_share=0.05, features=FeatureSettings(voxel=0.1, smooth=True)),
+    ),
     "kiss": ("kiss_matcher", lambda: Kiss(voxel=0.015, features=FeatureSettings(voxel=0.01, smooth=True))),
 }

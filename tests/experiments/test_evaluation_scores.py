@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from experiments.evaluation.cases import Case
+from experiments.evaluation.configs import noise_name
 from experiments.evaluation.predictions import Export, Predictions
 from experiments.evaluation.published import RECALL
 from experiments.evaluation.report import beaten_by
 from experiments.evaluation.scores import (
     Cell,
     cells_of,
-    noise_name,
     object_rows,
     pooled,
     recall_rows,

@@ -1,0 +1,69 @@
+"""What poses depend on beside settings: code, of which each method's own makes its own poses stale alone; libraries."""
+
+from __future__ import annotations
+
+import hashlib
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+_ROOT = Path(__file__).parents[2]
+# Of all methods: cases and refinement.
+_SHARED = (
+    *("kmn_jax/data", "kmn_jax/geometry", "kmn_jax/estimator/scan_crop.py", "kmn_jax/estimator/view.py"),
+    *(f"kmn_jax/pose/{name}.py" for name in ("icp", "kabsch", "result")),
+    *(f"experiments/evaluation/{name}.py" for name in ("cases", "clouds", "predictions", "refinement", "sources")),
+)
+_OURS = (
+    "kmn_jax/models",
+    *(f"kmn_jax/pose/{name}.py" for name in ("matches", "ransac", "surface")),
+    *(f"kmn_jax/estimator/{name}.py" for name in ("crop_pose", "part")),
+    "experiments/evaluation/methods.py",
+)
+_RIVALS = ("experiments/evaluation/rivals.py",)
+_LIBRARIES = ("jax", "jaxlib", "numpy", "open3d", "opencv-contrib-python-headless", "kiss-matcher")
+
+
+def shared_code() -> str:
+    """Return the SHA-256 of the code that decides the poses of all methods."""
+    return _digest(_SHARED)
+
+
+def our_code() -> str:
+    """Return the SHA-256 of the code of our methods, beside what is shared."""
+    return _digest(_OURS)
+
+
+def rivals_code() -> str:
+    """Return the SHA-256 of the code of rivals, beside what is shared."""
+    return _digest(_RIVALS)
+
+
+def library_versions() -> dict[str, str | None]:
+    """Return the versions of the libraries that decide poses, None of those that are not there."""
+
+    def found(name: str) -> str | None:
+        try:
+            return version(name)
+        except PackageNotFoundError:
+            return None
+
+    return {name: found(name) for name in _LIBRARIES}
+
+
+def sources(names: tuple[str, ...] = (*_SHARED, *_OURS, *_RIVALS)) -> list[Path]:
+    """Return the files of all code that decides poses, or of some of it, by files and folders."""
+    found: list[Path] = []
+    for place in (_ROOT / name for name in names):
+        files = [place] if place.is_file() else sorted(place.rglob("*.py"))
+        if not files:
+            raise FileNotFoundError(f"{place} decides poses, but is not there")
+        found += files
+    return found
+
+
+def _digest(names: tuple[str, ...]) -> str:
+    digest = hashlib.sha256()
+    for path in sources(names):
+        digest.update(path.relative_to(_ROOT).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
