@@ -25,7 +25,7 @@ from experiments.evaluation.methods import ONE_RANSAC, Ours, OursConfig, OwnNetw
 from experiments.evaluation.predictions import Export, check_files, export
 from experiments.evaluation.refinement import SETTINGS
 from experiments.evaluation.report import Result, draw_pictures, write_report
-from experiments.evaluation.rivals import OverMatches, missing
+from experiments.evaluation.rivals import Kiss, OverMatches, PointPairs, missing
 from experiments.evaluation.scores import cells_of
 from experiments.evaluation.sources import Report, bop_objects, cloud_objects
 from experiments.evaluation.tuned import RIVALS
@@ -73,8 +73,13 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
     """Run methods, score and report them; return the path of the report's page."""
     config = options.config
     folder = options.output or Path("outputs") / "evaluation" / config.name
+    if config.folder is not None and folder.resolve().is_relative_to(config.folder.resolve()):
+        raise InputError(f"{folder} is inside of {config.folder}, which is evaluated: choose another --output")
     problems: list[str] = []
     objects = _objects(config, partial(_note, problems))
+    for method in methods.values():
+        if isinstance(method, OwnNetworks):
+            method.check([found.name for found in objects])
     recipe = {
         "config": {key: value for key, value in asdict(config).items() if key not in _ELSEWHERE},
         "data": _data_digest(config),
@@ -89,6 +94,9 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
     for found, noise in ((found, noise) for found in objects for noise in config.noise):
         for problem in exported.truth(found.name, noise).problems:
             _note(problems, problem)
+    objects = [found for found in objects if any(exported.truth(found.name, noise).names for noise in config.noise)]
+    if not objects:
+        raise InputError(f"{config.folder} gave no crop that can be evaluated: {'; '.join(problems)}")
     titles = {key: method.name for key, method in methods.items()}
     cells = cells_of(exported, {found.name: found.model for found in objects}, titles, config.noise)
     used = {**exported.recipe, "methods": {key: exported.recipe["methods"][key] for key in methods}}
@@ -104,7 +112,8 @@ def _settings(method: Method) -> dict[str, Any]:
     """Return all that decides a method's poses, but for what decides those of all methods."""
     rivals = {"rivals' code": rivals_code()} if uses_rivals(method) else {}
     ours = {"our code": our_code()} if isinstance(method, Ours | OwnNetworks) else {}
-    return {**method.settings, **ours, **rivals}
+    library = library_versions([method.library]) if isinstance(method, Kiss | PointPairs) else {}
+    return {**method.settings, **ours, **rivals, **library}
 
 
 def uses_rivals(method: Method) -> bool:
@@ -176,8 +185,6 @@ def _objects(config: EvaluateConfig, report: Report) -> list[ObjectImages]:
             )
         found = bop_objects(config.folder, config.split, report, config.images)
     found = limited(found, config.objects)
-    if not found:
-        raise InputError(f"none of the objects is named {', '.join(config.objects)}")
     check_files([one.name for one in found], NAMES_FILE)
     return found
 
@@ -189,8 +196,9 @@ def _make_bins(folder: Path, cad: Path, names: tuple[str, ...]) -> None:
     """
     paths = sorted(path for path in cad.glob("*") if path.suffix.lower() in MESH_SUFFIXES)
     chosen = [path for path in paths if not names or any(name in path.stem for name in names)]
-    if not chosen:
-        raise InputError(f"{cad} holds no CAD file{f' named like {names}' if names else ''}")
+    absent = [name for name in names if not any(name in path.stem for path in paths)]
+    if absent or not chosen:
+        raise InputError(f"{cad} holds no CAD file{f' named like {absent[0]}' if absent else ''}")
     check_files([path.stem for path in chosen], str(cad))
     digests = [[path.stem, hashlib.sha256(read_file(path)).hexdigest()] for path in chosen]
     record = folder / _CAD_RECORD

@@ -15,6 +15,7 @@ from experiments.evaluation.cases import Method
 from experiments.evaluation.methods import ONE_RANSAC, Ours, OursConfig
 from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kiss, OverMatches, PointPairs, missing
 from experiments.evaluation.tuned import RIVALS
+from kmn_jax.checks import InputError
 from kmn_jax.models import Model
 
 # Voxels without smoothing and with it; finer where the coarse end of a first look was the worse one.
@@ -72,6 +73,9 @@ def tune(options: Options) -> Path:
     methods = {key: method for name in names if name not in skipped for key, method in methods_of(name, model).items()}
     if "ours" in options.config.methods:  # beside them
         methods["ours"] = Ours("kmn_jax", model)
+    if not methods:
+        there_are = f"none of them can run: {skipped}" if skipped else f"there are {', '.join(needed)}"
+        raise InputError(f"no rival to tune among {', '.join(options.config.methods)}: {there_are}")
     folder = options.output or Path("outputs") / "tuning" / options.config.name
     return compare(replace(options, output=folder), model, methods, skipped)
 

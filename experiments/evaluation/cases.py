@@ -99,8 +99,8 @@ def draw_cases(
 ) -> Iterator[Case]:
     """Yield so many crops of an object, evenly many of each scan, with Gaussian noise of a share of its longest side.
 
-    The same arguments give the same cases, and the same seeds at every noise. Scans that cannot be read, which are
-    reported, and those on which no copy can be seen are passed over, so there may be fewer. One scan is kept at a time.
+    The same arguments give the same cases, and the same seeds at every noise. Scans that cannot be read, or on which no
+    copy can be seen, give fewer, which is reported. One scan is kept at a time.
     """
     images = found.images
     sigma = noise * float((found.model.maximum - found.model.minimum).max())
@@ -116,6 +116,7 @@ def draw_cases(
             continue
         generator = np.random.default_rng([seed, zlib.crc32(image.name.encode())])
         rows, copies = _seeds(image, found.model, count, generator)
+        made = 0
         for draw, (place, copy) in enumerate(zip(rows.tolist(), copies.tolist(), strict=True)):
             offsets = image.points - image.points[place]
             near = image.foreground & (np.einsum("ij,ij->i", offsets, offsets) <= found.model.diameter**2)
@@ -126,7 +127,11 @@ def draw_cases(
             deviation = np.random.default_rng([seed, draw, zlib.crc32(image.name.encode())])
             noisy = points + sigma * deviation.standard_normal(points.shape, dtype=np.float32)
             name = f"{image.name}/{draw}"
+            made += 1
             yield Case(name, noisy.astype(np.float32), image.T_camera_object, copy, float(image.visible[copy]))
+        if made < count and report is not None:
+            why = "not enough was measured on copies that are seen (are units and poses right?)"
+            report(f"{found.name}, scan {image.name}: {made} of {count} crops: {why}")
 
 
 def _seeds(
@@ -134,6 +139,8 @@ def _seeds(
 ) -> tuple[Int[np.ndarray, " s"], Int[np.ndarray, " s"]]:
     """Return rows of points on random copies of which enough is seen, and the copies."""
     open_rows = np.flatnonzero(image.foreground)
+    if len(open_rows) == 0 or len(image.T_camera_object) == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     drawn = generator.choice(open_rows, min(_SEED_DRAWS, len(open_rows)), replace=False)
     owner = _owners(image.points[drawn], image.T_camera_object, model)
     usable = [
@@ -161,7 +168,11 @@ def _owners(
 
 
 def limited(objects: Sequence[ObjectImages], names: Sequence[str]) -> list[ObjectImages]:
-    """Return the objects of these names; all if none is given."""
+    """Return the objects of these names; all if none is given. Raises InputError if one is not there."""
+    known = [found.name for found in objects]
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise InputError(f"no object that can be evaluated is named {', '.join(unknown)}: there are {', '.join(known)}")
     return [found for found in objects if not names or found.name in names]
 
 

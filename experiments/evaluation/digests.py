@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -20,7 +21,7 @@ _OURS = (
     "experiments/evaluation/methods.py",
 )
 _RIVALS = ("experiments/evaluation/rivals.py",)
-_LIBRARIES = ("jax", "jaxlib", "numpy", "open3d", "opencv-contrib-python-headless", "kiss-matcher")
+_LIBRARIES = ("jax", "jaxlib", "numpy", "open3d")  # of all methods: open3d reads scans
 
 
 def shared_code() -> str:
@@ -38,8 +39,8 @@ def rivals_code() -> str:
     return _digest(_RIVALS)
 
 
-def library_versions() -> dict[str, str | None]:
-    """Return the versions of the libraries that decide poses, None of those that are not there."""
+def library_versions(names: Iterable[str] = _LIBRARIES) -> dict[str, str | None]:
+    """Return versions of libraries, unless others are named of those that decide all poses; None if not there."""
 
     def found(name: str) -> str | None:
         try:
@@ -47,7 +48,7 @@ def library_versions() -> dict[str, str | None]:
         except PackageNotFoundError:
             return None
 
-    return {name: found(name) for name in _LIBRARIES}
+    return {name: found(name) for name in names}
 
 
 def sources(names: tuple[str, ...] = (*_SHARED, *_OURS, *_RIVALS)) -> list[Path]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -118,10 +118,17 @@ class OwnNetworks:
         """The networks, and what Ours says of itself."""
         return {"networks": {name: model_digest(model) for name, model in self.models.items()}, **asdict(self.config)}
 
+    def check(self, names: Sequence[str]) -> None:
+        """Raise InputError if there is no network of one of these objects."""
+        without = [name for name in names if name not in self.models]
+        if without:
+            raise InputError(
+                f"there is no network of {', '.join(without)}: there are those of {', '.join(self.models)}"
+            )
+
     def prepare(self, model: ObjectModel) -> Solver:
         """Prepare an object with its own network. Raises InputError if there is none."""
-        if model.name not in self.models:
-            raise InputError(f"there is no network of {model.name}: there are those of {', '.join(self.models)}")
+        self.check([model.name])
         return Ours(self.name, self.models[model.name], self.config).prepare(model)
 
 

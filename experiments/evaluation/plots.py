@@ -14,42 +14,52 @@ from kmn_jax.checks import InputError
 
 
 def recall_plot(cells: Sequence[Cell], noises: Sequence[float]) -> bytes:
-    """Return a PNG: recall of all objects over noise, with intervals, and over the mean time without noise."""
-    figure, canvas = new_figure((12, 4.8))  # with one clear error if there is no matplotlib
+    """Return a PNG: recall of all objects, with intervals, over the mean time, and over noise if there are several.
+
+    Recall over time is that at the first noise, the time that of all noises.
+    """
+    over_noise: Any = None
+    if len(noises) > 1:
+        figure, canvas = new_figure((12, 4.8))  # with one clear error if there is no matplotlib
+        over_noise, over_time = figure.subplots(1, 2)
+    else:
+        figure, canvas = new_figure((8, 4.8))
+        over_time = figure.subplots()
     from matplotlib import ticker
 
-    over_noise, over_time = figure.subplots(1, 2)
     for number, method in enumerate(dict.fromkeys(cell.method for cell in cells)):
         own = [pooled([c for c in cells if c.method == method and c.noise == noise], "all") for noise in noises]
         recall = np.array([cell.recall() for cell in own])
         low, high = np.array([cell.interval() for cell in own]).T
-        style = {"color": f"C{number // 2 % 10}", "ls": "-" if method.endswith("ICP") else ":", "marker": "o", "ms": 4}
-        shift = 1 + 0.01 * number
-        places = [100 * noise * shift for noise in noises]
-        over_noise.errorbar(places, recall, [recall - low, high - recall], label=method, lw=1.2, capsize=2, **style)
+        spread = np.array([recall - low, high - recall])
+        refined = method.endswith("ICP")
+        style = {"color": f"C{number // 2 % 10}", "lw": 1.2, "capsize": 2, "ms": 4, "label": method}
         seconds = np.concatenate([cell.seconds for cell in own])
-        if len(seconds):
-            refined = method.endswith("ICP")
-            over_time.plot(1e3 * seconds.mean(), recall[0], "o" if refined else "x", color=style["color"])
-    over_noise.set(
-        title="dotted: without ICP",
-        xlabel="noise, % of the longest side",
-        ylabel="recall (ADI below 0.1 diameters)",
-        ylim=(0, 1.02),
-    )
-    figure.legend(*over_noise.get_legend_handles_labels(), loc="outside right upper", fontsize=7)
+        mean_ms = 1e3 * seconds.mean() if len(seconds) else np.nan
+        over_time.errorbar([mean_ms], recall[:1], spread[:, :1], ls="none", marker="o" if refined else "x", **style)
+        if over_noise is not None:
+            places = [100 * noise * (1 + 0.01 * number) for noise in noises]
+            over_noise.errorbar(places, recall, spread, ls="-" if refined else ":", marker="o", **style)
+    figure.legend(*over_time.get_legend_handles_labels(), loc="outside right upper", fontsize=7)
     over_time.set(
         title="crosses: without ICP",
         xlabel="mean ms a crop, warm",
         xscale="log",
-        ylabel=f"recall, {noise_name(noises[0])}",
+        ylabel=f"recall, {noise_name(noises[0])} (ADI below 0.1 diameters)",
         ylim=(0, 1.02),
     )
     over_time.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
     over_time.xaxis.set_major_formatter(ticker.ScalarFormatter())
     over_time.xaxis.set_minor_formatter(ticker.NullFormatter())
-    for axis in (over_noise, over_time):
-        axis.grid(alpha=0.3)
+    over_time.grid(alpha=0.3)
+    if over_noise is not None:
+        over_noise.set(
+            title="dotted: without ICP",
+            xlabel="noise, % of the longest side",
+            ylabel="recall (ADI below 0.1 diameters)",
+            ylim=(0, 1.02),
+        )
+        over_noise.grid(alpha=0.3)
     return as_png(canvas)
 
 

@@ -6,10 +6,11 @@ stopped. What was made by another recipe (config, data, weights, code) is refuse
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -66,6 +67,8 @@ class Export:
             old = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
         except (OSError, ValueError) as error:
             raise InputError(f"{file} cannot be read ({error}): choose another folder with --output") from None
+        if not isinstance(old, dict | None):
+            raise InputError(f"{file} is no recipe: choose another folder with --output")
         if old is not None:
             stale = _differing(old, plain)
             if stale and not overwrite:
@@ -75,8 +78,7 @@ class Export:
                 )
             for name in stale:
                 method = name.removeprefix(_OF_METHOD)
-                for made in (folder / _slug(method) if method != name else folder).rglob("*.safetensors"):
-                    made.unlink()
+                _delete(folder.glob(f"{_slug(method) if method != name else '*'}/*.safetensors"))
             if not any(not name.startswith(_OF_METHOD) for name in stale):  # what other methods found stays
                 plain["methods"] = {**old.get("methods", {}), **plain.get("methods", {})}
         write_whole(file, (json.dumps(plain, indent=1) + "\n").encode())
@@ -151,6 +153,14 @@ class Export:
         return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()
 
 
+def _delete(paths: Iterable[Path]) -> None:
+    """Delete those that are predictions, whole ones: what else lies there is somebody's own."""
+    for path in paths:
+        with contextlib.suppress(InputError):
+            if read_safetensors(path)[1].get("format") == _HEADER:
+                path.unlink()
+
+
 def _differing(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Return what differs between recipes, methods one by one; what only one of them has of these is no difference."""
     shared = [key for key in sorted({*old, *new} - {"methods"}) if old.get(key) != new.get(key)]
@@ -170,22 +180,29 @@ def export(
     from tqdm import tqdm
 
     units = [(found, noise) for found in objects for noise in noises]
-    bar = tqdm(total=len(units) * len(methods), unit="set", desc="poses")
-    for found, noise in units:
-        missing = {key: method for key, method in methods.items() if not folder.has(key, found.name, noise)}
-        bar.update(len(methods) - len(missing))
-        known = folder.has("cases", found.name, noise)
-        if not missing and known:
-            continue
-        problems: list[str] = []
-        cases = list(draw_cases(found, crops, noise, seed, problems.append))
-        folder.write_truth(found.name, noise, cases, problems)
-        refine = Refinement(found.model)
-        for key, method in missing.items():
-            bar.set_postfix_str(f"{found.name[:24]}, noise {noise:g}, {method.name}", refresh=True)
-            folder.write(key, found.name, noise, _solved(method.prepare(found.model), refine, cases))
-            bar.update()
-    bar.close()
+    with tqdm(total=len(units) * len(methods), unit="set", desc="poses") as bar:
+        for found, noise in units:
+            missing = {key: method for key, method in methods.items() if not folder.has(key, found.name, noise)}
+            bar.update(len(methods) - len(missing))
+            known = folder.has("cases", found.name, noise)
+            if not missing and known:
+                continue
+            problems: list[str] = []
+            cases = list(draw_cases(found, crops, noise, seed, problems.append))
+            folder.write_truth(found.name, noise, cases, problems)
+            refine = Refinement(found.model)
+            for key, method in missing.items():
+                bar.set_postfix_str(f"{found.name[:24]}, noise {noise:g}, {method.name}", refresh=True)
+                try:
+                    solved = _solved(method.prepare(found.model), refine, cases)
+                except InputError:
+                    raise
+                except Exception as error:  # of somebody else's library, mostly; what was found before is kept
+                    kind = f"{type(error).__name__}: {error}".splitlines()[0]
+                    where = f"{method.name} failed on {found.name} at noise {noise:g}"
+                    raise InputError(f"{where} ({kind}): leave it out with --methods") from error
+                folder.write(key, found.name, noise, solved)
+                bar.update()
 
 
 def _solved(solve: Callable[[Case], Any], refine: Refinement, cases: Sequence[Case]) -> Predictions:

@@ -101,7 +101,11 @@ def _sections(result: Result) -> list[tuple[str, str, list[dict[str, Any]]]]:
     config, cells = result.config, result.cells
     objects = list(dict.fromkeys(cell.object for cell in cells))
     rows = recall_rows(cells, "all")
-    sections = [(f"Recall on {len(objects)} objects, {config.crops} crops of each", _GATES, rows)]
+    least, most = (function(len(cell.errors) for cell in cells) for function in (min, max))
+    crops = f"{most} crops" if least == most else f"{least} to {most} crops"
+    sections = [
+        (f"Recall on {len(objects)} {'object' if len(objects) == 1 else 'objects, each'}, {crops}", _GATES, rows)
+    ]
     if config.name in RECALL:
         sections.append(("Published", f"{SOURCE}. {MILLISECONDS}.", RECALL[config.name]))
     if OURS in result.methods:
@@ -149,7 +153,7 @@ def _facts(result: Result) -> dict[str, str]:
         "Date": environment["date"],
         "Machine": f"{environment['processor']}, {environment['cores']} cores, {environment['platform']}",
         "Versions": versions,
-        "Weights": f"{result.config.weights}, SHA-256 {result.weights[:16]}",
+        "Weights": f"{result.config.weights}, digest of its parameters {result.weights[:16]}",
         "Data": f"{result.config.name}, digest {str(result.recipe['data'])[:16]}, seed {result.config.seed}",
     }
 
@@ -177,9 +181,8 @@ def _page(
     }
     for number, (title, text, rows) in enumerate(sections):
         body += [f"<h2>{html.escape(title)}</h2>", _paragraphs(text), _table(rows)]
-        if number == 0:
-            body.append(drawn.pop("recall", ""))
-    body += [f"<h2>{html.escape(name)}</h2>{image}" for name, image in drawn.items()]
+        if number == 0:  # what tells most comes first
+            body += drawn.values()
     return _PAGE.replace("{title}", html.escape(result.config.name)).replace("{body}", "\n".join(body))
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
@@ -137,6 +137,7 @@ class PointPairs:
     sampling: float = 0.07  # of model and votes' distances
     scene_share: float = 0.2  # of the scene's points are reference points
     features: FeatureSettings = FeatureSettings(voxel=0.05)
+    library: ClassVar[str] = "opencv-contrib-python-headless"
 
     @property
     def settings(self) -> Mapping[str, Any]:
@@ -189,6 +190,7 @@ class Kiss:
     name: str = "KISS-Matcher"
     voxel: float = 0.025
     features: FeatureSettings | None = None  # to smooth the crop first, if given
+    library: ClassVar[str] = "kiss-matcher"
 
     @property
     def settings(self) -> Mapping[str, Any]:

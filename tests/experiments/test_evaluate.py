@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import importlib.metadata
 import json
 import re
 import shutil
@@ -16,13 +17,14 @@ import pytest
 
 from experiments import ablate, evaluate, tune_rivals
 from experiments.evaluation import digests, predictions
-from experiments.evaluation.cases import Case, ObjectImages, draw_cases
+from experiments.evaluation.cases import Case, ObjectImages, Solver, draw_cases
 from experiments.evaluation.configs import EvaluateConfig
 from experiments.evaluation.methods import Ours, OwnNetworks
 from experiments.evaluation.rivals import FastGlobal, Fpfh, Kiss, OverMatches, PointPairs, missing
 from experiments.evaluation.sources import bop_objects, cloud_objects
 from experiments.evaluation.tuned import RIVALS
 from kmn_jax.checks import InputError
+from kmn_jax.data.cad import ObjectModel
 from kmn_jax.models import create_model, load_model, released_file, save_model
 from kmn_jax.pose import adi
 from tests.data.bop_sample import save_image
@@ -251,13 +253,39 @@ def test_rivals_are_tuned_by_settings_side_by_side(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(tune_rivals, "_VOXELS", {"fpfh": ((0.05,), (0.05,)), "kiss": ((0.03,), (0.03,))})
     options = ["demo", "--objects", GEAR, "--images", "1", "--crops", "2", "--output", str(tmp_path / "out")]
     assert tune_rivals.main(options) == 0
-    settings = json.loads((tmp_path / "out" / "scores.json").read_text())["recipe"]["methods"]
+    recipe = json.loads((tmp_path / "out" / "scores.json").read_text())["recipe"]
+    settings = recipe["methods"]
     rivals = {f"{name}{how}" for name in ("fpfh_0.05", "kiss_0.03") for how in ("", "_smoothed")}
     assert set(settings) == {*rivals, "ours"}
     assert "rivals' code" not in settings["ours"]
     assert settings["fpfh_0.05_smoothed"]["features"]["smooth"]
     assert settings["fpfh_0.05"]["features"]["voxel"] == 0.05
     assert settings["fpfh_0.05"]["rivals' code"] == digests.rivals_code()
+    # The version of a rival's library is a matter of this rival alone: it can be installed, or updated, later.
+    assert settings["kiss_0.03"]["kiss-matcher"] == importlib.metadata.version("kiss-matcher")
+    assert {*recipe["versions"]} == {"jax", "jaxlib", "numpy", "open3d"}
+
+
+def test_without_a_rival_there_is_nothing_to_tune(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert tune_rivals.main(["demo", "--methods", "ours_ransac", "--output", str(tmp_path / "out")]) == 2
+    assert "no rival to tune among ours_ransac: there are fpfh" in capsys.readouterr().err
+
+
+def test_a_method_that_fails_ends_the_run_in_a_sentence_and_what_was_found_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def prepare(self: Kiss, model: ObjectModel) -> Solver:
+        def solve(case: Case) -> np.ndarray | None:
+            raise RuntimeError("no clique\nat all")
+
+        return solve
+
+    monkeypatch.setattr(Kiss, "prepare", prepare)
+    options = ["--objects", GEAR, "--images", "1", "--crops", "2", "--methods", "fpfh", "kiss"]
+    assert evaluate.main(["demo", *options, "--output", str(tmp_path)]) == 2
+    expected = f"KISS-Matcher failed on {GEAR} at noise 0 (RuntimeError: no clique): leave it out with --methods"
+    assert capsys.readouterr().err.splitlines()[-1] == f"evaluate: {expected}"
+    assert (tmp_path / "fpfh" / f"{GEAR}.noise0.safetensors").exists()
 
 
 def test_networks_of_one_object_each_are_a_method(
@@ -286,7 +314,8 @@ def test_networks_of_one_object_each_are_a_method(
         (["bop", "--folder", "no_such_folder"], "no_such_folder"),
         (["clouds", "--folder", "no_such_folder"], "not a folder"),
         (["demo", "--methods", "magic"], "no method 'magic'"),
-        (["demo", "--objects", "none"], "none of the objects is named none"),
+        (["demo", "--objects", GEAR, "none"], "no object that can be evaluated is named none: there are"),
+        (["demo", "--output", str(SMALL / "out")], "which is evaluated: choose another --output"),
         (["demo", "--crops", "0"], "must be 1 or more"),
         (["demo", "--noise", "2"], "noise"),
         (["demo", "--seed", "-1"], "seed is -1, but must be 0 or more"),

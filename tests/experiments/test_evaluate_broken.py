@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from experiments import evaluate
-from experiments.evaluation.cases import Image, ObjectImages, draw_cases
+from experiments.evaluation.cases import Image as Scan
+from experiments.evaluation.cases import ObjectImages, draw_cases
 from kmn_jax.checks import InputError
 from kmn_jax.data.bop import dataset_digest
-from tests.data.bop_sample import box_model
+from tests.data.bop_sample import box_model, save_image
 from tests.reference.poses import some_poses
 
 SMALL = Path(evaluate.__file__).parent / "assets" / "small_test_set"
@@ -51,6 +53,26 @@ def test_truncated_images_are_reported_on_every_run_and_the_rest_is_evaluated(
     assert mask.name in report
 
 
+def test_scans_that_show_too_little_are_told_and_a_run_of_nothing_fails(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "data"
+    shutil.copytree(SMALL, folder)
+    for path in (folder / GEARS / "depth").glob("*.png"):
+        save_image(path, np.zeros_like(np.asarray(Image.open(path))))
+    options = ["--folder", str(folder), "--images", "2", "--methods", "fpfh", "--crops", "2", "--noise", "0"]
+    assert evaluate.main(["bop", *options, "--output", str(tmp_path / "out")]) == 0
+    content = json.loads((tmp_path / "out" / "scores.json").read_text())
+    assert "gear_motor" not in {cell["object"] for cell in content["cells"]}
+    told = [line for line in content["left out"] if line.startswith("gear_motor")]
+    assert len(told) == 2
+    assert "0 of 1 crops: not enough was measured" in told[0]
+    assert told[0] in capsys.readouterr().err
+    alone = ["--objects", "gear_motor", "--output", str(tmp_path / "alone")]
+    assert evaluate.main(["bop", *options, *alone]) == 2
+    assert "gave no crop that can be evaluated: gear_motor, scan" in capsys.readouterr().err
+
+
 def test_the_digest_of_damaged_images_is_that_of_their_bytes(tmp_path: Path) -> None:
     folder = tmp_path / "data"
     shutil.copytree(SMALL, folder)
@@ -72,12 +94,12 @@ class Scans:
     def __len__(self) -> int:
         return self.count
 
-    def __getitem__(self, row: int, /) -> Image:
+    def __getitem__(self, row: int, /) -> Scan:
         self.read.append(row)
         if row == self.broken:
             raise InputError(f"scan {row} is broken")
         points = np.repeat(self.model.points @ self.pose[:3, :3].T + self.pose[:3, 3], 20, axis=0).astype(np.float32)
-        return Image(str(row), points, np.ones(len(points), dtype=bool), self.pose[None], np.ones(1))
+        return Scan(str(row), points, np.ones(len(points), dtype=bool), self.pose[None], np.ones(1))
 
 
 def test_only_scans_of_which_crops_are_drawn_are_read() -> None:

@@ -53,12 +53,16 @@ def test_bins_are_those_of_the_cad_files(
     assert "--cad" in capsys.readouterr().err  # they are not whole
     for arguments in (with_cad, with_cad, options):  # goes on, finds all of them there, needs the files no more
         assert evaluate.main(arguments) == 2
-        assert "none of the objects is named none" in capsys.readouterr().err
+        assert "no object that can be evaluated is named none" in capsys.readouterr().err
     assert made == [["a", "b"]] * 3
 
     (cad / "b.stl").write_text("another part")
     assert evaluate.main(with_cad) == 2
     assert "bins holds bins of other CAD files" in capsys.readouterr().err
+    (cad / "b.stl").unlink()
+    assert evaluate.main(with_cad) == 2
+    assert f"{cad} holds no CAD file named like b" in capsys.readouterr().err
+    (cad / "b.stl").write_text("another part")
     (folder / ".cad.json").unlink()
     assert evaluate.main(with_cad) == 2
     assert "choose another --folder, or delete it" in capsys.readouterr().err
@@ -89,10 +93,12 @@ def test_objects_whose_files_would_be_the_same_are_refused(tmp_path: Path, capsy
 def test_files_that_are_not_there_are_one_sentence(
     option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    np.save(tmp_path / "scan.npy", np.random.default_rng(0).normal(size=(100, 3)))
-    (tmp_path / "scan.txt").write_text(" ".join(map(str, some_poses(1)[0].ravel().tolist())))
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    np.save(folder / "scan.npy", np.random.default_rng(0).normal(size=(100, 3)))
+    (folder / "scan.txt").write_text(" ".join(map(str, some_poses(1)[0].ravel().tolist())))
     shutil.copy(SMALL / "models" / "obj_000002.ply", tmp_path / "part.ply")
     given = {"--object": tmp_path / "part.ply", "--camera": tmp_path / "camera.json"} | {option: Path("nosuch.file")}
     arguments = [word for key, path in given.items() for word in (key, str(path))]
-    assert evaluate.main(["clouds", "--folder", str(tmp_path), "--output", str(tmp_path / "out"), *arguments]) == 2
+    assert evaluate.main(["clouds", "--folder", str(folder), "--output", str(tmp_path / "out"), *arguments]) == 2
     assert "nosuch.file cannot be read: No such file or directory" in capsys.readouterr().err

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.numpy import save
 
 from experiments.evaluation.cases import Case
 from experiments.evaluation.configs import noise_name
@@ -154,8 +155,11 @@ def test_a_method_can_be_added_and_one_of_other_settings_is_refused(tmp_path: Pa
         opened({"a": 2})
     kept = opened({"a": 1, "b": 1})
     assert len(kept.read("a", "box", NOISE).found) == len(kept.read("b", "box", NOISE).found) == 0
+    own = folder / "a" / "network.safetensors"
+    own.write_bytes(save({"weights": np.zeros(1)}))  # somebody's own
     changed = opened({"a": 2}, overwrite=True)
     assert not changed.path("a", "box", NOISE).exists()
+    assert own.exists()
     assert len(changed.read("b", "box", NOISE).found) == 0
 
 
@@ -183,3 +187,6 @@ def test_a_file_of_another_recipe_or_none_is_refused(tmp_path: Path, exported: E
     (tmp_path / "other" / "recipe.json").write_text("{")
     with pytest.raises(InputError, match=r"recipe\.json"):
         Export.open(tmp_path / "other", {"config": 2}, overwrite=False)
+    (tmp_path / "other" / "recipe.json").write_text("[]")
+    with pytest.raises(InputError, match="is no recipe"):
+        Export.open(tmp_path / "other", {"config": 2}, overwrite=True)
