@@ -9,16 +9,16 @@ from jaxtyping import Array, Float
 
 from experiments.evaluation.cases import Case, padded
 from kmn_jax.data.cad import ObjectModel
+from kmn_jax.data.crops import CropConfig
 from kmn_jax.data.smoothing import SmoothConfig
-from kmn_jax.estimator.scan_crop import SceneArrays, drawn_crop
+from kmn_jax.estimator.scan_crop import SceneArrays, first_crop
 from kmn_jax.pose import IcpConfig, icp
 from kmn_jax.typing import Pose, PRNGKey, Scalar
 
 CONFIG = IcpConfig(iterations=20)
-_OBJECT_POINTS, _SCENE_POINTS = 1024, 512
-_NORMAL_POINTS = 4096
-_SMOOTH = SmoothConfig()
-SETTINGS = {"icp": CONFIG, "object points": _OBJECT_POINTS, "scene points": _SCENE_POINTS, "smooth": _SMOOTH}
+_OBJECT_POINTS = 1024
+_CROP = CropConfig(num_points=512, max_noise=0.0, normal_points=4096, min_points=16, smooth=SmoothConfig())
+SETTINGS = {"icp": CONFIG, "object points": _OBJECT_POINTS, "scene": _CROP}
 
 
 class Refinement:
@@ -29,7 +29,7 @@ class Refinement:
         self._diameter = jnp.float32(model.diameter)
 
     def __call__(self, case: Case, T_camera_object: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        """Return a pose that is no worse."""
+        """Return the pose that ICP ends at."""
         origin = case.points[0].astype(np.float64)
         pose = T_camera_object.copy()
         pose[:3, 3] -= origin
@@ -44,7 +44,7 @@ class Refinement:
 def _refined(
     points: Float[Array, "m 3"], scene: SceneArrays, T_crop_object: Pose, diameter: Scalar, key: PRNGKey
 ) -> Pose:
-    crop = drawn_crop(scene, diameter, key, _SCENE_POINTS, _NORMAL_POINTS, _SMOOTH)
+    crop = first_crop(scene, diameter, key, _CROP)
     fine = icp(
         points,
         crop.points,

@@ -142,8 +142,7 @@ def crop_around(
         seed, points = seed + points[0], jnp.where(mask[:, None], points - points[:1], 0)
     else:
         normals, known = normals_within_radius(points, noisy, config.normal_radius * diameter, drawn)
-    normals = jnp.where(known[:, None], orient_to_camera(points, normals, -seed), _unit(-seed[None] - points))
-    normals = jnp.where(mask[:, None], normals, 0)
+    normals = jnp.where(mask[:, None], camera_normals(points, normals, known, -seed), 0)
 
     instance = jnp.where(found, visible.instance[seed_row], 0)
     pose = jnp.where(found, T_camera_object[instance].astype(jnp.float32), jnp.eye(4))
@@ -166,6 +165,13 @@ def crop_around(
         num_inside=num_inside,
         valid=num_inside >= config.min_points,
     )
+
+
+def camera_normals(
+    points: Float[Array, "n 3"], normals: Float[Array, "n 3"], known: Bool[Array, " n"], camera: Float[Array, "3"]
+) -> Float[Array, "n 3"]:
+    """Return normals turned towards a camera; where one is not known, the direction to it."""
+    return jnp.where(known[:, None], orient_to_camera(points, normals, camera), _unit(camera[None] - points))
 
 
 def _check_points(visible: VisiblePoints) -> None:

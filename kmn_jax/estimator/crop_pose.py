@@ -17,11 +17,10 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
-from kmn_jax.data.crops import Crop, CropConfig, crop_around
+from kmn_jax.data.crops import Crop, CropConfig, camera_normals
 from kmn_jax.data.smoothing import SmoothConfig, smoothed
 from kmn_jax.estimator.part import PartArrays
-from kmn_jax.estimator.scan_crop import SceneArrays, as_visible
-from kmn_jax.geometry import orient_to_camera
+from kmn_jax.estimator.scan_crop import SceneArrays, even_rows, first_crop
 from kmn_jax.geometry.ball_normals import normals_within_radius
 from kmn_jax.models import KeyMatchNet
 from kmn_jax.pose import (
@@ -101,9 +100,7 @@ def crop_for_draws(part: PartArrays, scene: SceneArrays, key: PRNGKey, num_point
     """Return the crop around a scene's first point as `crop_pose` takes it with the same key, without normals."""
     count = max(config.num_draws * (num_points - 1) + 1, config.normal_points)
     crops = CropConfig(num_points=count, normals="surface", max_noise=0.0, min_points=min(16, num_points))
-    nowhere = jnp.zeros((1, 3)), jnp.eye(4)[None]
-    seed_row, found = jnp.int32(0), jnp.bool_(True)
-    return crop_around(_crop_key(key), as_visible(scene), seed_row, found, *nowhere, part.diameter, crops)
+    return first_crop(scene, part.diameter, _crop_key(key), crops)
 
 
 def draw_of_crop(
@@ -117,19 +114,14 @@ def draw_of_crop(
     slots = max(config.num_draws * others, 1)  # of all draws, which lie evenly over the points
     total = jnp.maximum(crop.mask.sum(dtype=jnp.int32) - 1, others)
     slot = jnp.arange(others, dtype=jnp.int32) * config.num_draws + jnp.asarray(draw, dtype=jnp.int32)
-    spread = slot * (total // slots) + slot * (total % slots) // slots  # slot * total may be beyond int32
-    rows = jnp.concatenate([jnp.zeros(1, jnp.int32), 1 + spread])
+    rows = jnp.concatenate([jnp.zeros(1, jnp.int32), 1 + even_rows(slot, total, slots)])
     mask = crop.mask[rows]
     points = jnp.where(mask[:, None], crop.points[rows], 0)
     if config.smooth is None:
         normals, known = normals_within_radius(points, crop.points, CropConfig.normal_radius * diameter, crop.mask)
     else:
         points, normals, known, _ = smoothed(points, mask, crop.points, crop.mask, diameter, config.smooth)
-    to_camera = -crop.seed[None] - points
-    length = jnp.sqrt((to_camera**2).sum(axis=1, keepdims=True))
-    normals = jnp.where(
-        known[:, None], orient_to_camera(points, normals, -crop.seed), to_camera / jnp.where(length > 0, length, 1)
-    )
+    normals = camera_normals(points, normals, known, -crop.seed)
     return Draw(points, jnp.where(mask[:, None], normals, 0), mask)
 
 

@@ -123,6 +123,13 @@ def make_part(found: ObjectModel, model: Model, digest: str | None = None) -> Pa
     )
 
 
+def arrays_of(model: Model, part: Part) -> PartArrays:
+    """Return what a search needs of a part."""
+    count = model.config.num_object_points
+    points, normals = jnp.asarray(part.points[:count]), jnp.asarray(part.normals[:count])
+    return PartArrays(points, normals, jnp.asarray(part.features), jnp.float32(part.diameter))
+
+
 def save_part(part: Part, path: str | Path) -> None:
     """Write an object card, of less than a megabyte; it holds arrays and text only."""
     tensors = {
@@ -219,10 +226,3 @@ def _part(tensors: dict[str, np.ndarray], facts: dict[str, object]) -> Part:
         source_digest=str(facts["source_digest"]),
         model_digest=str(facts["model_digest"]),
     )
-
-
-def arrays_of(model: Model, part: Part) -> PartArrays:
-    """Return what a search needs of a part."""
-    count = model.config.num_object_points
-    points, normals = jnp.asarray(part.points[:count]), jnp.asarray(part.normals[:count])
-    return PartArrays(points, normals, jnp.asarray(part.features), jnp.float32(part.diameter))

@@ -6,10 +6,9 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32
+from jaxtyping import Array, Bool, Float, Float32, Int
 
 from kmn_jax.data.crops import Crop, CropConfig, crop_around
-from kmn_jax.data.smoothing import SmoothConfig
 from kmn_jax.data.splat import BIN, VisiblePoints
 from kmn_jax.typing import PRNGKey, Scalar
 
@@ -41,21 +40,12 @@ def as_visible(scene: SceneArrays) -> VisiblePoints:
     )
 
 
-def drawn_crop(
-    scene: SceneArrays,
-    diameter: Scalar,
-    key: PRNGKey,
-    num_points: int,
-    normal_points: int,
-    smooth: SmoothConfig | None,
-) -> Crop:
-    """Return some of the points within a diameter of a scene's first point, with their normals, relative to it."""
-    crops = CropConfig(
-        num_points=num_points,
-        max_noise=0.0,
-        normal_points=normal_points,
-        min_points=min(16, num_points),
-        smooth=smooth,
-    )
+def first_crop(scene: SceneArrays, diameter: Scalar, key: PRNGKey, config: CropConfig) -> Crop:
+    """Return the crop around a scene's first point, without labels."""
     nowhere = jnp.zeros((1, 3)), jnp.eye(4)[None]
-    return crop_around(key, as_visible(scene), jnp.int32(0), jnp.bool_(True), *nowhere, diameter, crops)
+    return crop_around(key, as_visible(scene), jnp.int32(0), jnp.bool_(True), *nowhere, diameter, config)
+
+
+def even_rows(place: Int[Array, " p"], total: Int[Array, ""], count: int) -> Int[Array, " p"]:
+    """Return place * total // count, the rows of `count` places that lie evenly among `total`; no product overflows."""
+    return place * (total // count) + place * (total % count) // count

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from kmn_jax.data.crops import CropConfig, crop_around
 from kmn_jax.estimator.part import PartArrays
-from kmn_jax.estimator.scan_crop import SceneArrays, as_visible
+from kmn_jax.estimator.scan_crop import SceneArrays, as_visible, even_rows
 from kmn_jax.geometry import farthest_point_indices
 from kmn_jax.pose import IcpConfig, MatchConfig, PoseResult, RansacConfig, find_matches, icp, ransac_modes
 from kmn_jax.typing import PRNGKey, Scalar
@@ -179,8 +179,7 @@ def spread_rows(mask: Bool[Array, " n"], count: int) -> tuple[Int[Array, " c"], 
     total = mask.sum(dtype=jnp.int32)
     order = jnp.nonzero(mask, size=mask.shape[0], fill_value=0)[0]
     place = jnp.arange(count, dtype=jnp.int32)
-    spread = place * (total // count) + place * (total % count) // count  # place * total may be beyond int32
-    return order[jnp.where(total > count, spread, place)], place < total
+    return order[jnp.where(total > count, even_rows(place, total, count), place)], place < total
 
 
 def each(function: Callable[..., _Result], real: Bool[Array, " s"], *items: Any) -> _Result:
