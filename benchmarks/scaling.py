@@ -34,6 +34,9 @@ from kmn_jax.pose import RansacConfig, ransac
 from kmn_jax.report import print_table, write_json
 from kmn_jax.train.sharding import split_cpu
 
+_CELLS, _SCAN_EVERY, _SCAN_SEEDS = 1000, 10, 16  # a fleet: robots, seconds a pick, crops of a scan
+_OBJECTS = 10_000  # of a catalogue
+
 
 class Sweep(NamedTuple):
     """Calls of one kind at growing sizes."""
@@ -99,11 +102,14 @@ def main(repeats: int = 9, json: Path | None = None, picture: Path | None = None
         )
     devices = device_rows(repeats)
     objects = catalogue_rows()
+    (searches,) = (growth for sweep, _, growth in series if sweep.size == "seeds")
+    plan = plan_rows(searches, objects[0])
     print_table("time and temporary memory", rows)
     print_table("fits", fits)
     print_table("training over devices, here parts of one CPU", devices)
     print_table("what an object takes", objects)
-    write_json(json, {"rows": rows, "fits": fits, "devices": devices, "objects": objects})
+    print_table("on paper, from these: what a fleet and a catalogue would need", plan)
+    write_json(json, {"rows": rows, "fits": fits, "devices": devices, "objects": objects, "plan": plan})
     if picture is not None:
         picture.write_bytes(_plot(series))
 
@@ -198,6 +204,25 @@ def catalogue_rows() -> list[dict[str, Any]]:
     held = sum(leaf.nbytes for leaf in jax.tree.leaves(arrays_of(model, part)))
     ms = time_in_turn({"encode": lambda: make_part(found, model)}, 9)["encode"].median_ms
     return [{"network": "small", "card kB": stored / 1e3, "on the device kB": held / 1e3, "encode ms": ms}]
+
+
+def plan_rows(search: Growth, each: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return what a fleet of cells and a catalogue of objects would need of machines like this one.
+
+    Args:
+        search: how the time of a scan grows with its seeds.
+        each: a row of `catalogue_rows`.
+    """
+    scan_ms = search.at(_SCAN_SEEDS)
+    scans = _CELLS / _SCAN_EVERY
+    return [
+        {"what": f"a scan, {_SCAN_SEEDS} seeds: ms", "needed": scan_ms},
+        {"what": f"{_CELLS} cells, a scan every {_SCAN_EVERY} s: scans a second", "needed": scans},
+        {"what": "their searches: machines that do nothing else", "needed": scans * scan_ms / 1e3},
+        {"what": f"{_OBJECTS} objects: GB of cards on disk", "needed": _OBJECTS * each["card kB"] / 1e6},
+        {"what": "held on the device: MB", "needed": _OBJECTS * each["on the device kB"] / 1e3},
+        {"what": "encoding all after the network has changed: minutes", "needed": _OBJECTS * each["encode ms"] / 60e3},
+    ]
 
 
 def _sweep(what: str, size: str, function: Callable[..., Any], cases: Mapping[int, tuple[Any, ...]]) -> Sweep:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.scaling import Growth, fitted
+from benchmarks.scaling import Growth, fitted, plan_rows
 
 
 def test_fits_find_what_times_are_made_of() -> None:
@@ -23,3 +23,10 @@ def test_the_bend_is_where_the_square_takes_over() -> None:
     assert bend is not None
     assert growth.square * bend**2 == pytest.approx(growth.constant + growth.linear * bend)
     assert Growth(1.0, 1.0, 0.0).bend is None
+
+
+def test_a_plan_counts_machines_and_bytes() -> None:
+    needed = [
+        row["needed"] for row in plan_rows(Growth(10, 5, 0), {"card kB": 100, "on the device kB": 20, "encode ms": 6})
+    ]
+    assert needed == pytest.approx([90, 100, 9, 1, 200, 1])
