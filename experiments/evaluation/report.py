@@ -102,10 +102,8 @@ def _sections(result: Result) -> list[tuple[str, str, list[dict[str, Any]]]]:
     objects = list(dict.fromkeys(cell.object for cell in cells))
     rows = recall_rows(cells, "all")
     least, most = (function(len(cell.errors) for cell in cells) for function in (min, max))
-    crops = f"{most} crops" if least == most else f"{least} to {most} crops"
-    sections = [
-        (f"Recall on {len(objects)} {'object' if len(objects) == 1 else 'objects, each'}, {crops}", _GATES, rows)
-    ]
+    crops = f"{most} crops of each" if least == most else f"{least} to {most} crops of each"
+    sections = [(f"Recall, objects: {len(objects)}, {crops}", _GATES, rows)]
     if config.name in RECALL:
         sections.append(("Published", f"{SOURCE}. {MILLISECONDS}.", RECALL[config.name]))
     if OURS in result.methods:
