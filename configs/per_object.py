@@ -8,8 +8,9 @@ per_object
                python -m experiments.train per_object --pack outputs/packs/PART --folder runs/PART
     Data:      the PLY file of the test set, not the CAD file that it was made of: keypoints are its first points, and
                an evaluation refuses networks of another file.
-    Hardware:  2 CPU cores. Not yet run.
-    Expected:  not yet known.
+    Hardware:  one core of an AMD EPYC beside other work, 2026-11-22: 57 minutes for the bearing housing (N = 1), 33 for
+               the gear motor (N = 3).
+    Expected:  on validation segmentation 0.980 and 0.992, keypoints 0.554 and 0.462; poses in experiments/RESULTS.md.
 """
 
 from __future__ import annotations
