@@ -4,7 +4,7 @@ normalization_metric, normalization_released
     Command:   python -m experiments.build_data electronics --limit 120 --folder outputs/packs/electronics_120
                python -m experiments.train normalization_metric --folder runs/normalization_metric
                python -m experiments.evaluate validation --methods ours
-                   --weights runs/normalization_metric/last.safetensors, and the same with normalization_released.
+                   --weights runs/normalization_metric/model.safetensors, and the same with normalization_released.
     Hardware:  2 CPU cores. Not yet run.
     Expected:  not yet known.
 """
