@@ -10,12 +10,13 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import jax
 import tyro
 
 from experiments.evaluation.cases import Method, ObjectImages, limited
@@ -42,6 +43,7 @@ from kmn_jax.pose import RansacConfig
 from kmn_jax.report import environment, processor
 
 _CAD_RECORD = ".cad.json"  # of which files bins were made; hidden, so that digests pass over it
+_TOGETHER = 8  # methods that are run on a crop before the next crop
 # Fields that the rest of the recipe tells, or that decide nothing.
 _ELSEWHERE = ("name", "methods", "weights", "cad", "cad_names")
 
@@ -90,7 +92,9 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
         "processor": processor(),
     }
     exported = Export.open(folder, recipe, options.overwrite)
-    export(objects, methods, config.noise, config.crops, config.seed, exported)
+    for some in _some_at_a_time(methods):
+        export(objects, some, config.noise, config.crops, config.seed, exported)
+        jax.clear_caches()
     for found, noise in ((found, noise) for found in objects for noise in config.noise):
         for problem in exported.truth(found.name, noise).problems:
             _note(problems, problem)
@@ -106,6 +110,13 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
         config, environment(), model_digest(model), used, cells, skipped, tuple(problems), methods, tuple(commits)
     )
     return write_report(folder, result, draw_pictures(result, objects, exported))
+
+
+def _some_at_a_time(methods: Mapping[str, Method]) -> Iterator[dict[str, Method]]:
+    """Yield a few after a few: what many compile takes all memory maps that Linux allows a process."""
+    keys = list(methods)
+    for first in range(0, len(keys), _TOGETHER):
+        yield {key: methods[key] for key in keys[first : first + _TOGETHER]}
 
 
 def _settings(method: Method) -> dict[str, Any]:

@@ -19,6 +19,19 @@ def test_a_ratio_that_has_fallen_too_far_is_named() -> None:
     assert all(row["least"] == pytest.approx(10 * gate.LEAST) for row in rows)
 
 
+def test_what_has_fallen_is_measured_again_and_only_that() -> None:
+    baseline, calls = {"steady": 10.0, "disturbed": 10.0, "slower": 10.0}, list[str]()
+
+    def measure(name: str) -> float:
+        calls.append(name)
+        return {"disturbed": 9.0, "slower": 5.0}[name]
+
+    ratios = gate.looked_at_again({"steady": 10.0, "disturbed": 4.0, "slower": 4.0}, baseline, measure)
+    assert ratios == {"steady": 10.0, "disturbed": 9.0, "slower": 5.0}
+    assert calls == ["disturbed", "slower", "slower"]
+    assert gate.compared(ratios, baseline)[1] == ["slower"]
+
+
 def test_a_baseline_of_other_pairs_is_refused() -> None:
     with pytest.raises(InputError, match="'b', 'c'"):
         gate.compared({"a": 1.0, "b": 1.0}, {"a": 1.0, "c": 1.0})

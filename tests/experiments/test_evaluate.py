@@ -237,6 +237,7 @@ def modules_of(file: Path) -> set[str]:
 def test_an_ablation_changes_one_choice_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = {"10 keypoints": ablate.VARIANTS["10 keypoints"], "256 points": ablate.VARIANTS["256 points"]}
     monkeypatch.setattr(ablate, "VARIANTS", chosen)
+    monkeypatch.setattr(evaluate, "_TOGETHER", 2)  # of three
     options = ["demo", "--objects", GEAR, "--images", "1", "--crops", "3", "--output", str(tmp_path / "out")]
     assert ablate.main(options) == 0
     content = json.loads((tmp_path / "out" / "scores.json").read_text())
