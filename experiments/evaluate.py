@@ -92,9 +92,10 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
         "processor": processor(),
     }
     exported = Export.open(folder, recipe, options.overwrite)
-    for some in _some_at_a_time(methods):
+    for number, some in enumerate(_some_at_a_time(methods)):
+        if number > 0:
+            jax.clear_caches()
         export(objects, some, config.noise, config.crops, config.seed, exported)
-        jax.clear_caches()
     for found, noise in ((found, noise) for found in objects for noise in config.noise):
         for problem in exported.truth(found.name, noise).problems:
             _note(problems, problem)
