@@ -15,6 +15,7 @@ from jaxtyping import Float
 from experiments.evaluation.cases import Case, Solver, padded
 from kmn_jax.checks import InputError
 from kmn_jax.data.cad import ObjectModel
+from kmn_jax.data.crops import Crop
 from kmn_jax.estimator.crop_pose import (
     CropPoseConfig,
     Said,
@@ -132,7 +133,6 @@ class OwnNetworks:
         return Ours(self.name, self.models[model.name], self.config).prepare(model)
 
 
-@partial(jax.jit, static_argnames=("graphdef", "config", "num_points"))
 def _said(
     graphdef: nnx.GraphDef,
     parameters: nnx.State,
@@ -144,8 +144,20 @@ def _said(
 ) -> tuple[Said, jax.Array]:
     """Return what the network says of the first draw of `crop_pose` with the same key, and the crop's seed."""
     crop = crop_for_draws(part, scene, key, num_points, config)
+    return _first_said(graphdef, parameters, part, crop, num_points, config), crop.seed
+
+
+@partial(jax.jit, static_argnames=("graphdef", "config", "num_points"))
+def _first_said(
+    graphdef: nnx.GraphDef,
+    parameters: nnx.State,
+    part: PartArrays,
+    crop: Crop,
+    num_points: int,
+    config: CropPoseConfig,
+) -> Said:
     draw = draw_of_crop(crop, 0, part.diameter, num_points, config)
-    return said_of_draw(nnx.merge(graphdef, parameters), part, draw), crop.seed
+    return said_of_draw(nnx.merge(graphdef, parameters), part, draw)
 
 
 _matches = jax.jit(matches_of, static_argnames="config")

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from experiments.evaluation.cases import Case, padded
 from kmn_jax.data.cad import ObjectModel
 from kmn_jax.data.crops import CropConfig
 from kmn_jax.data.smoothing import SmoothConfig
-from kmn_jax.estimator.scan_crop import SceneArrays, first_crop
+from kmn_jax.estimator.scan_crop import first_crop
 from kmn_jax.pose import IcpConfig, icp
-from kmn_jax.typing import Pose, PRNGKey, Scalar
 
 CONFIG = IcpConfig(iterations=20)
 _OBJECT_POINTS = 1024
@@ -33,25 +34,19 @@ class Refinement:
         origin = case.points[0].astype(np.float64)
         pose = T_camera_object.copy()
         pose[:3, 3] -= origin
-        key = jax.random.key(case.random_seed)
-        found = _refined(self._points, padded(case.points), pose.astype(np.float32), self._diameter, key)
-        pose = np.asarray(found, dtype=np.float64)
+        crop = _crop(padded(case.points), self._diameter, jax.random.key(case.random_seed))
+        fine = _fine(
+            self._points,
+            crop.points,
+            pose.astype(np.float32),
+            self._diameter,
+            scene_normals=crop.normals,
+            scene_mask=crop.mask,
+        )
+        pose = np.asarray(fine.T_scene_object, dtype=np.float64)
         pose[:3, 3] += origin
         return pose
 
 
-@jax.jit
-def _refined(
-    points: Float[Array, "m 3"], scene: SceneArrays, T_crop_object: Pose, diameter: Scalar, key: PRNGKey
-) -> Pose:
-    crop = first_crop(scene, diameter, key, _CROP)
-    fine = icp(
-        points,
-        crop.points,
-        T_crop_object,
-        diameter,
-        scene_normals=crop.normals,
-        scene_mask=crop.mask,
-        config=CONFIG,
-    )
-    return fine.T_scene_object
+_crop = jax.jit(partial(first_crop, config=_CROP))  # of points around the first one, for every capacity
+_fine = jax.jit(partial(icp, config=CONFIG))

@@ -1,4 +1,6 @@
-"""The pose of the copy in the middle of one crop, from points to pose in one compiled call.
+"""The pose of the copy in the middle of one crop, from points to pose.
+
+Compiled in two: what takes the crop out of the scene, for every capacity of scenes, and all that follows, once.
 
 The network sees several draws of the crop's points, as another draw often succeeds where one fails, but no more once
 the measured surface confirms a pose well enough. Of all poses that the matches of a draw agree on, the one that it
@@ -96,6 +98,7 @@ class Draw(NamedTuple):
     mask: Bool[Array, " n"]
 
 
+@partial(jax.jit, static_argnames=("num_points", "config"))
 def crop_for_draws(part: PartArrays, scene: SceneArrays, key: PRNGKey, num_points: int, config: CropPoseConfig) -> Crop:
     """Return the crop around a scene's first point as `crop_pose` takes it with the same key, without normals."""
     count = max(config.num_draws * (num_points - 1) + 1, config.normal_points)
@@ -217,7 +220,6 @@ def surface_scores(
     return jax.lax.map(one, poses)
 
 
-@partial(jax.jit, static_argnames=("graphdef", "config", "num_points"))
 def crop_pose(
     graphdef: nnx.GraphDef,
     parameters: nnx.State,
@@ -233,6 +235,19 @@ def crop_pose(
     made for. Inlier counts are those of the matches of the draw that the pose is from, its mask that draw's.
     """
     crop = crop_for_draws(part, scene, key, num_points, config)
+    return _pose_in_crop(graphdef, parameters, part, crop, key, num_points, config)
+
+
+@partial(jax.jit, static_argnames=("graphdef", "config", "num_points"))
+def _pose_in_crop(
+    graphdef: nnx.GraphDef,
+    parameters: nnx.State,
+    part: PartArrays,
+    crop: Crop,
+    key: PRNGKey,
+    num_points: int,
+    config: CropPoseConfig,
+) -> PoseResult:
     _, said, poses, scores = search_draws(nnx.merge(graphdef, parameters), part, crop, key, num_points, config)
     best, mode = jnp.unravel_index(jnp.argmax(scores), scores.shape)
     found: PoseResult = jax.tree.map(lambda leaf: leaf[best, mode], poses)
