@@ -98,12 +98,16 @@ class Draw(NamedTuple):
     mask: Bool[Array, " n"]
 
 
-@partial(jax.jit, static_argnames=("num_points", "config"))
 def crop_for_draws(part: PartArrays, scene: SceneArrays, key: PRNGKey, num_points: int, config: CropPoseConfig) -> Crop:
     """Return the crop around a scene's first point as `crop_pose` takes it with the same key, without normals."""
     count = max(config.num_draws * (num_points - 1) + 1, config.normal_points)
     crops = CropConfig(num_points=count, normals="surface", max_noise=0.0, min_points=min(16, num_points))
-    return first_crop(scene, part.diameter, _crop_key(key), crops)
+    return _crop(scene, part.diameter, key, crops)
+
+
+@partial(jax.jit, static_argnames="config")
+def _crop(scene: SceneArrays, diameter: Scalar, key: PRNGKey, config: CropConfig) -> Crop:
+    return first_crop(scene, diameter, _crop_key(key), config)
 
 
 def draw_of_crop(

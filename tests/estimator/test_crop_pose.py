@@ -12,6 +12,7 @@ import pytest
 from flax import nnx
 
 import experiments
+import kmn_jax.estimator.crop_pose as crop_pose_module
 from experiments.evaluation.cases import Case, ObjectImages, draw_cases, padded
 from experiments.evaluation.sources import bop_objects
 from kmn_jax.estimator.crop_pose import (
@@ -70,6 +71,19 @@ def test_parts_are_found_where_they_lie(model: Model, part: PartArrays, cases: l
 def test_the_same_key_gives_the_same_bits(model: Model, part: PartArrays, cases: list[Case]) -> None:
     one, other = (solve(model, part, padded(cases[0].points)) for _ in range(2))
     np.testing.assert_array_equal(one.T_scene_object, other.T_scene_object)
+
+
+def test_a_larger_capacity_gives_the_same_pose_and_compiles_the_crop_alone(
+    model: Model, part: PartArrays, cases: list[Case]
+) -> None:
+    scene = padded(cases[0].points)
+    larger = jax.tree.map(lambda leaf: jnp.concatenate([leaf, jnp.zeros_like(leaf)]), scene)
+    one = solve(model, part, scene)
+    before = crop_pose_module._pose_in_crop._cache_size(), crop_pose_module._crop._cache_size()
+    other = solve(model, part, larger)
+    after = crop_pose_module._pose_in_crop._cache_size(), crop_pose_module._crop._cache_size()
+    np.testing.assert_array_equal(one.T_scene_object, other.T_scene_object)
+    assert after == (before[0], before[1] + 1)
 
 
 def test_metres_and_millimetres_give_one_pose(model: Model, part: PartArrays, cases: list[Case]) -> None:

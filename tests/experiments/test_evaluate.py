@@ -74,11 +74,13 @@ def test_rivals_find_a_part_that_lies_there_alone(gear: ObjectImages, kind: type
     seen = points[((gear.model.normals @ pose[:3, :3].T) * points).sum(axis=1) < 0].astype(np.float32)
     method = kind(sampling=0.1) if kind is PointPairs else kind()
     solve = method.prepare(gear.model)
-    found = [solve(Case(f"alone/{number}", seen, pose[None], 0, 1.0)) for number in range(3)]
+    alone = [Case(f"alone/{number}", seen, pose[None], 0, 1.0) for number in range(3)]
+    found = [solve(case) for case in alone]
     right = [
         one is not None and float(adi(one, pose, gear.model.points[:1000])) < 0.1 * gear.model.diameter for one in found
     ]
     assert sum(right) >= 2
+    np.testing.assert_array_equal(solve(alone[0]), found[0])  # an evaluation gives the same numbers again
 
 
 def test_a_package_that_is_missing_or_broken_is_told_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
