@@ -98,8 +98,10 @@ class Ours:
         return CropPrediction(points[mask], taken[mask], keypoint[mask].astype(np.int32))
 
     def _said(self, arrays: PartArrays, scene: SceneArrays, key: PRNGKey) -> tuple[Said, jax.Array]:
-        network = self.model.graphdef, self.model.parameters
-        return _said(*network, arrays, scene, key, self._num_points, self.config.pose)
+        """Return what the network says of the first draw of `crop_pose` with the same key, and the crop's seed."""
+        count, config = self._num_points, self.config.pose
+        crop = crop_for_draws(arrays, scene, key, count, config)
+        return _first_said(self.model.graphdef, self.model.parameters, arrays, crop, count, config), crop.seed
 
     @property
     def _num_points(self) -> int:
@@ -131,20 +133,6 @@ class OwnNetworks:
         """Prepare an object with its own network. Raises InputError if there is none."""
         self.check([model.name])
         return Ours(self.name, self.models[model.name], self.config).prepare(model)
-
-
-def _said(
-    graphdef: nnx.GraphDef,
-    parameters: nnx.State,
-    part: PartArrays,
-    scene: SceneArrays,
-    key: PRNGKey,
-    num_points: int,
-    config: CropPoseConfig,
-) -> tuple[Said, jax.Array]:
-    """Return what the network says of the first draw of `crop_pose` with the same key, and the crop's seed."""
-    crop = crop_for_draws(part, scene, key, num_points, config)
-    return _first_said(graphdef, parameters, part, crop, num_points, config), crop.seed
 
 
 @partial(jax.jit, static_argnames=("graphdef", "config", "num_points"))
