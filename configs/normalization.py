@@ -6,7 +6,7 @@ normalization_metric, normalization_released
                python -m experiments.evaluate validation --methods ours
                    --weights outputs/runs/normalization_metric/model.safetensors
                    --output outputs/evaluation/normalization_metric, and the same with normalization_released.
-    Hardware:  one core each, two side by side, of an AMD EPYC; 13 minutes of data, 20 and 17 of training, 2026-11-23.
+    Hardware:  one core each, two side by side, of an AMD EPYC; 10 minutes of data, 20 and 17 of training, 2026-11-23.
     Expected:  recall without noise 0.76 ("metric") and 0.57 ("released"), experiments/RESULTS.md.
 """
 
