@@ -29,12 +29,13 @@ from benchmarks.network_cases import (
     head_features,
     make_case,
     match,
+    points_in_order,
 )
 from benchmarks.stages import REFINED, small_crop
 from benchmarks.timing import compile_for, time_in_turn
 from kmn_jax.checks import InputError
 from kmn_jax.estimator.crop_pose import crop_pose
-from kmn_jax.geometry.knn import k_nearest, squared_distances
+from kmn_jax.geometry.knn import neighbor_graph, squared_distances
 from kmn_jax.models.normalization import released_object, released_scene
 from kmn_jax.report import print_table, write_json
 from tests.reference import dense_jax
@@ -152,10 +153,10 @@ def head_pair(case: Case) -> Pair:
 
 
 def neighbor_pair(width: int) -> Pair:
-    """Exact neighbours of drawn points."""
-    x = jax.random.normal(jax.random.key(0), (2048, width))
+    """Exact neighbours of drawn points, in order as in the network."""
+    x = points_in_order(2048, width)
     return Pair(
-        _ready(lambda x: k_nearest(x, x, 20), x), _ready(lambda x: jax.lax.top_k(-squared_distances(x, x), 20)[1], x)
+        _ready(lambda x: neighbor_graph(x, 20), x), _ready(lambda x: jax.lax.top_k(-squared_distances(x, x), 20)[1], x)
     )
 
 

@@ -1,4 +1,4 @@
-"""Exact nearest neighbours: ours, one plain `top_k` in JAX, and PyTorch.
+"""Exact nearest neighbours: ours, one plain `top_k` in JAX, and PyTorch, of points in the network's order and shuffled.
 
 python -m benchmarks.knn [--sizes 1024 2048 4096] [--widths 3 64] [--repeats 15] [--json FILE]
 """
@@ -16,8 +16,9 @@ import jax
 import numpy as np
 import tyro
 
+from benchmarks.network_cases import points_in_order
 from benchmarks.timing import compile_for, time_in_turn
-from kmn_jax.geometry.knn import k_nearest, squared_distances
+from kmn_jax.geometry.knn import k_nearest, neighbor_graph, squared_distances
 from kmn_jax.report import print_table, write_json
 
 
@@ -43,10 +44,20 @@ def main(
 
 
 def knn_rows(size: int, width: int, k: int, repeats: int) -> list[dict[str, Any]]:
-    """Time all forms on one cloud and compare their neighbour sets with float64."""
-    x = jax.random.normal(jax.random.key(0), (size, width))
+    """Time all forms on one cloud in two orders, and compare their neighbour sets with float64."""
+    along_curve = points_in_order(size, width)
+    shuffled = jax.random.permutation(jax.random.key(0), along_curve)
+    return [
+        {"points": size, "width": width, "order": order, **row}
+        for order, x in (("along the curve", along_curve), ("shuffled", shuffled))
+        for row in _rows(x, k, repeats)
+    ]
+
+
+def _rows(x: jax.Array, k: int, repeats: int) -> list[dict[str, Any]]:
     forms: dict[str, Callable[[jax.Array], jax.Array]] = {
-        "ours": lambda x: k_nearest(x, x, k),
+        "neighbor_graph": lambda x: neighbor_graph(x, k),
+        "k_nearest": lambda x: k_nearest(x, x, k),
         "one top_k": lambda x: jax.lax.top_k(-squared_distances(x, x), k)[1],
         "distances alone": lambda x: squared_distances(x, x),
     }
@@ -58,8 +69,6 @@ def knn_rows(size: int, width: int, k: int, repeats: int) -> list[dict[str, Any]
     times = time_in_turn(calls, repeats)
     return [
         {
-            "points": size,
-            "width": width,
             "form": name,
             "ms": steady.median_ms,
             "min ms": steady.minimum_ms,

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from kmn_jax.geometry.order import space_filling_order
 from kmn_jax.models import RELEASED_CONFIG, Model, create_model, model_structure, save_released
 from kmn_jax.models.layers import Compute
 from kmn_jax.models.normalization import released_object, released_scene
@@ -83,6 +84,13 @@ def cached_forward(graphdef: nnx.GraphDef, parameters: nnx.State, crops: jax.Arr
 def head_features(keypoints: int = 20) -> tuple[jax.Array, jax.Array]:
     """Return drawn features of 2048 points and of an object's keypoints, for the pair head alone."""
     return jax.random.normal(jax.random.key(0), (2048, 512)), jax.random.normal(jax.random.key(1), (keypoints, 128))
+
+
+def points_in_order(count: int, width: int) -> jax.Array:
+    """Return drawn points as the encoder orders them, or features (count, width) that vary smoothly in space."""
+    points = jax.random.normal(jax.random.key(0), (count, 3))
+    points = points[space_filling_order(points)[0]]
+    return points if width == 3 else jnp.tanh(points @ jax.random.normal(jax.random.key(1), (3, width)))
 
 
 def match(graphdef: nnx.GraphDef, parameters: nnx.State, scene: jax.Array, part: jax.Array) -> Any:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from benchmarks import training, work
-from benchmarks.network_cases import Case
+from benchmarks.network_cases import Case, encode_objects
 from benchmarks.timing import compile_for
 from benchmarks.work import Work
 from configs import find_config
@@ -35,8 +35,10 @@ from kmn_jax.estimator.crop_pose import (
 )
 from kmn_jax.estimator.part import PartArrays, arrays_of, make_part
 from kmn_jax.estimator.scan_crop import SceneArrays
-from kmn_jax.geometry.knn import k_nearest
+from kmn_jax.geometry.knn import neighbor_graph
+from kmn_jax.geometry.order import space_filling_order
 from kmn_jax.models import Model, load_pretrained
+from kmn_jax.models.normalization import released_scene
 from kmn_jax.pose import IcpConfig
 
 _SMALL_SET = Path("experiments/assets/small_test_set")
@@ -72,31 +74,37 @@ def small_crop() -> SmallCrop:
 
 
 def network_stages(case: Case) -> dict[str, Stage]:
-    """Return the stages of the published network at batch 1, on what the stage before it would give in size."""
+    """Return the stages of the published network at batch 1, each on what the stage before it gives."""
     model, config = case.model, case.model.config
-    points, width = config.num_scene_points, config.edge_width
-    xyz, x1 = case.crops[0][:, :3], _normal(0, points, width)
-    graph = jax.jit(lambda x: k_nearest(x, x, config.num_neighbors))(x1)
-    local, scene = _normal(1, points, 3 * width), _normal(2, points, config.scene_width)
-    part = _normal(3, config.num_keypoints, config.object_width)
+    points, count = config.num_scene_points, config.num_neighbors
 
     def of_network(function: Callable[..., Any], *arguments: jax.Array) -> Callable[[], Any]:
         ready = compile_for(lambda p, *a: function(nnx.merge(model.graphdef, p), *a), model.parameters, *arguments)
         return lambda: ready.function(model.parameters, *arguments)
 
-    def nearest(x: jax.Array) -> Callable[[], Any]:
-        return of_network(lambda _, x: k_nearest(x, x, config.num_neighbors), x)
+    def ordered(_: Any, cloud: jax.Array) -> tuple[jax.Array, jax.Array]:
+        order, places = space_filling_order(cloud[:, :3])
+        return cloud[order], places
 
-    calls = {
-        "kNN on coordinates": nearest(xyz),
-        "EdgeConv 1": of_network(lambda net, x, g: net.scene.edge1(x, g, "float32"), case.crops[0], graph),
-        "kNN on features, first": nearest(x1),
-        "EdgeConv 2": of_network(lambda net, x, g: net.scene.edge2(x, g, "float32"), x1, graph),
-        "kNN on features, second": nearest(local[:, :width]),
-        "EdgeConv 3": of_network(lambda net, x, g: net.scene.edge3(x, g, "float32"), x1, graph),
-        "global and output layers": of_network(lambda net, x: net.scene._with_global(x, "float32", None), local),
-        "pair head": of_network(lambda net, s, o: net.match(s, o), scene, part),
-    }
+    def nearest(_: Any, x: jax.Array) -> jax.Array:
+        return neighbor_graph(x, count)
+
+    calls = {"order of the points": of_network(ordered, released_scene(case.crops[0], None))}
+    cloud, _ = calls["order of the points"]()
+    x, graph, local = cloud, jnp.zeros(0), []
+    for block, searched in enumerate(("coordinates", "features, first", "features, second"), start=1):
+        calls[f"kNN on {searched}"] = of_network(nearest, x if block > 1 else cloud[:, :3])
+        graph = calls[f"kNN on {searched}"]()
+        calls[f"EdgeConv {block}"] = of_network(
+            lambda net, x, g, block=block: getattr(net.scene, f"edge{block}")(x, g, "float32"), x, graph
+        )
+        x = calls[f"EdgeConv {block}"]()
+        local.append(x)
+    calls["global and output layers"] = of_network(
+        lambda net, x: net.scene._with_global(x, "float32", None), jnp.concatenate(local, axis=1)
+    )
+    scene, part = calls["global and output layers"](), encode_objects(*model, case)[0]
+    calls["pair head"] = of_network(lambda net, s, o: net.match(s, o), scene, part)
     return _joined(calls, work.scene_stages(config, points))
 
 
@@ -186,10 +194,6 @@ def _joined(calls: Mapping[str, Callable[[], Any]], of_stage: Mapping[str, Work]
     if set(calls) != set(of_stage):
         raise ValueError(f"stages and their work differ: {set(calls) ^ set(of_stage)}")
     return {name: Stage(call, of_stage[name]) for name, call in calls.items()}
-
-
-def _normal(seed: int, *shape: int) -> jax.Array:
-    return jax.random.normal(jax.random.key(seed), shape, dtype=jnp.float32)
 
 
 def _refuse(problem: str) -> None:

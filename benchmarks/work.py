@@ -90,6 +90,7 @@ def scene_stages(config: KeyMatchNetConfig, points: int) -> dict[str, Work]:
     pairs = NUM_PAIR_INVARIANTS if invariant else 0
     count, width = min(config.num_neighbors, points), config.edge_width
     stages = {
+        "order of the points": Work(0.0, _FLOAT * points * (2.0 * _RAW + 1)),
         "kNN on coordinates": neighbors(points, 3, count),
         "EdgeConv 1": edge_conv(points, count, inputs, width, 2, pairs),
         "kNN on features, first": neighbors(points, width, count),

@@ -2,8 +2,9 @@
 
 from kmn_jax.geometry.crop import Selection, radius_crop, voxel_thin
 from kmn_jax.geometry.eigen import dominant_eigenvector
-from kmn_jax.geometry.knn import k_nearest, largest_distance, nearest, squared_distances
+from kmn_jax.geometry.knn import k_nearest, largest_distance, nearest, neighbor_graph, squared_distances
 from kmn_jax.geometry.normals import depth_normals, depth_to_points, estimate_normals, orient_to_camera
+from kmn_jax.geometry.order import space_filling_order
 from kmn_jax.geometry.sampling import farthest_point_indices
 from kmn_jax.geometry.se3 import (
     compose,
@@ -36,6 +37,7 @@ __all__ = [
     "largest_distance",
     "matrix_to_quaternion",
     "nearest",
+    "neighbor_graph",
     "orient_to_camera",
     "pose_error",
     "quaternion_to_matrix",
@@ -44,6 +46,7 @@ __all__ = [
     "random_rotation",
     "rotate_vectors",
     "rotation_angle_between",
+    "space_filling_order",
     "squared_distances",
     "transform_points",
     "translation_between",

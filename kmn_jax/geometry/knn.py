@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 _COORDINATES = 3
 _CPU_PARTS = 32  # fewer than about ten ready operations XLA's CPU runtime keeps on one thread
+_CPU_ROWS = 16  # smaller parts take longer to compile than they save
 
 
 def squared_distances(queries: Float[Array, "n c"], points: Float[Array, "m c"]) -> Float[Array, "n m"]:
@@ -41,16 +42,44 @@ def k_nearest(
     list ends in repeats of the nearest one, so that a maximum over neighbours stays right. Ties go to the lower
     index. All but masked points must be finite. Raises ValueError if k is not in [1, m].
     """
-    if not 1 <= k <= points.shape[0]:
-        raise ValueError(f"k = {k} neighbours asked of {points.shape[0]} points: choose k between 1 and their number")
+    _check_k(k, points.shape[0])
     if queries.shape[0] == 0:
         return jnp.zeros((0, k), dtype=jnp.int32)
     queries, points = _centered(queries, points, mask)
-    values, indices = jax.lax.platform_dependent(
+    selected = jax.lax.platform_dependent(
         queries, points, mask, cpu=partial(_k_smallest_in_parts, k=k), default=partial(_k_smallest, k=k)
     )
-    # Without the barrier XLA merges the slice into the selection, which then falls back to a full sort; with
-    # the values unused, it lets the parts share one buffer for them, and so wait for each other.
+    return _repeat_nearest(*selected)
+
+
+def neighbor_graph(points: Float[Array, "n c"], k: int, mask: Bool[Array, " n"] | None = None) -> Int[Array, "n k"]:
+    """Return for each point its k nearest among all of them, itself included: `k_nearest`, but for ties.
+
+    On CPUs it is faster the nearer points of similar index are (see `space_filling_order`): a row's selection starts
+    at its own index, and the sooner it meets the nearest, the fewer others it keeps for a while. Ties go to either.
+    """
+    _check_k(k, points.shape[0])
+    points, _ = _centered(points, points, mask)
+    selected = jax.lax.platform_dependent(
+        points,
+        mask,
+        cpu=partial(_k_smallest_from_own_index, k=k),
+        default=lambda points, mask: _k_smallest(points, points, mask, k),
+    )
+    return _repeat_nearest(*selected)
+
+
+def _check_k(k: int, count: int) -> None:
+    if not 1 <= k <= count:
+        raise ValueError(f"k = {k} neighbours asked of {count} points: choose k between 1 and their number")
+
+
+def _repeat_nearest(values: Float[Array, "n k"], indices: Int[Array, "n k"]) -> Int[Array, "n k"]:
+    """Put the nearest in the place of masked points.
+
+    Without the barrier XLA merges the slice into the selection, which then falls back to a full sort; with
+    the values unused, it lets the parts share one buffer for them, and so wait for each other.
+    """
     values, indices = jax.lax.optimization_barrier((values, indices))
     return jnp.where(jnp.isfinite(values), indices, indices[:, :1])
 
@@ -70,10 +99,38 @@ def _k_smallest_in_parts(
     queries: Float[Array, "n c"], points: Float[Array, "m c"], mask: Bool[Array, " m"] | None, k: int
 ) -> tuple[Float[Array, "n k"], Int[Array, "n k"]]:
     """The same for CPUs, where one `top_k` runs on one core, but independent ones run side by side."""
-    size = -(-queries.shape[0] // _CPU_PARTS)
+    size = _part_size(queries.shape[0])
     parts = [_k_smallest(queries[i : i + size], points, mask, k) for i in range(0, queries.shape[0], size)]
     values, indices = zip(*parts, strict=True)
     return jnp.concatenate(values), jnp.concatenate(indices)
+
+
+def _part_size(rows: int) -> int:
+    return max(-(-rows // _CPU_PARTS), _CPU_ROWS)
+
+
+def _k_smallest_from_own_index(
+    points: Float[Array, "n c"], mask: Bool[Array, " n"] | None, k: int
+) -> tuple[Float[Array, "n k"], Int[Array, "n k"]]:
+    """The same for points among themselves: each part meets its own points first, then those after, then before.
+
+    XLA's `top_k` on CPUs passes the candidates once and keeps a heap of the k smallest so far.
+    """
+    count = points.shape[0]
+    size = _part_size(count)
+    twice = jax.lax.optimization_barrier(jnp.concatenate([points, points]))
+    mask_twice = None if mask is None else jnp.concatenate([mask, mask])
+    starts = range(0, count, size)
+    parts = [
+        _k_smallest(
+            points[i : i + size], twice[i : i + count], None if mask_twice is None else mask_twice[i:][:count], k
+        )
+        for i in starts
+    ]
+    values, after_start = (jnp.concatenate(each) for each in zip(*parts, strict=True))
+    start = jnp.arange(count, dtype=jnp.int32)[:, None] // size * size
+    indices = after_start + start
+    return values, jnp.where(indices < count, indices, indices - count)
 
 
 def nearest(

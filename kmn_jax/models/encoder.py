@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
-from kmn_jax.geometry.knn import k_nearest
+from kmn_jax.geometry.knn import k_nearest, neighbor_graph
+from kmn_jax.geometry.order import space_filling_order
 from kmn_jax.models.edgeconv import EdgeConv
 from kmn_jax.models.invariants import EncoderInputs
 from kmn_jax.models.layers import Compute, NormalizedLinear, channel_moments, product
@@ -55,16 +56,20 @@ class Encoder(nnx.Module):
         """Return one feature per point, or per keypoint when `keypoint_indices` are given.
 
         Rows where `mask` is false are padding: they are nobody's neighbour and count in no statistic; their
-        own features mean nothing.
+        own features mean nothing. Inside, points are in an order in which near ones are close in memory.
         """
+        order, places = space_filling_order(inputs.xyz, mask)
+        inputs, mask = inputs.rows(order), None if mask is None else mask[order]
+        if keypoint_indices is not None:
+            keypoint_indices = places[keypoint_indices]
         k = min(self.num_neighbors, inputs.xyz.shape[0])
         edge_mask = None if mask is None else mask[:, None] & (jnp.arange(k)[None, :] < mask.sum())
-        graph = k_nearest(inputs.xyz, inputs.xyz, k, mask)
+        graph = neighbor_graph(inputs.xyz, k, mask)
         x1 = self.edge1(inputs.point_features, graph, compute, None, edge_mask, inputs.pair_features(graph))
         if keypoint_indices is None:
-            graph = graph if self.graph == "static" else k_nearest(x1, x1, k, mask)
+            graph = graph if self.graph == "static" else neighbor_graph(x1, k, mask)
             x2 = self.edge2(x1, graph, compute, None, edge_mask)
-            graph = graph if self.graph == "static" else k_nearest(x2, x2, k, mask)
+            graph = graph if self.graph == "static" else neighbor_graph(x2, k, mask)
             x3 = self.edge3(x2, graph, compute, None, edge_mask)
         else:
             centers = x1[keypoint_indices]
@@ -73,7 +78,8 @@ class Encoder(nnx.Module):
             x2 = self.edge2(x1, graph, compute, centers, edge_mask)
             x1, x3, mask = centers, self.edge3.complete_graph(x2, compute), None
         local = jnp.concatenate([x1, x2, x3], axis=1)
-        return self._with_global(local, compute, mask)
+        features = self._with_global(local, compute, mask)
+        return features[places] if keypoint_indices is None else features
 
     def _with_global(
         self, local: Float[Array, "n l"], compute: Compute, mask: Bool[Array, " n"] | None

@@ -21,6 +21,11 @@ class EncoderInputs(NamedTuple):
     point_features: Float[Array, "n f"]
     normals: Float[Array, "n 3"] | None
 
+    def rows(self, indices: Int[Array, " m"]) -> EncoderInputs:
+        """Return the points of these indices."""
+        normals = None if self.normals is None else self.normals[indices]
+        return EncoderInputs(self.xyz[indices], self.point_features[indices], normals)
+
     def pair_features(self, graph: Int[Array, "n k"]) -> Float[Array, "n k 4"] | None:
         """Return the point pair features of every edge, or None for raw inputs.
 

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.geometry import k_nearest, nearest, squared_distances
+from kmn_jax.geometry import k_nearest, nearest, neighbor_graph, squared_distances
 
 SEEDS = range(3)
 jitted = jax.jit(k_nearest, static_argnums=2)
+jitted_graph = jax.jit(neighbor_graph, static_argnums=1)
 
 
 def clouds(seed: int, queries: int, points: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -139,3 +140,51 @@ def test_tight_clusters_far_apart_keep_their_own() -> None:
 
 def test_no_queries_have_no_neighbours() -> None:
     assert k_nearest(jnp.zeros((0, 3)), jnp.zeros((9, 3)), 5).shape == (0, 5)
+
+
+@pytest.mark.parametrize("width", [3, 64])
+@pytest.mark.parametrize("count", [9, 33, 70, 200])
+def test_the_graph_is_each_points_nearest(count: int, width: int) -> None:
+    _, points = clouds(count, 1, count, width)
+    found = np.asarray(jitted_graph(points, 9))
+    np.testing.assert_array_equal(np.sort(found), np.sort(jitted(points, points, 9)))
+    assert (found == np.arange(count)[:, None]).any(axis=1).all()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_in_the_graph_padding_is_never_found_whatever_it_holds(seed: int) -> None:
+    _, points = clouds(seed, 1, 70, 3)
+    mask = np.arange(70) % 3 != 0
+    padded = np.where(mask[:, None], points, np.nan).astype(np.float32)
+    found = np.asarray(jitted_graph(padded, 9, mask))
+    np.testing.assert_array_equal(np.sort(found[mask]), np.sort(jitted(points[mask], padded, 9, mask)))
+
+
+def test_in_the_graph_of_fewer_real_points_than_k_each_repeats_itself() -> None:
+    _, points = clouds(0, 1, 70, 3)
+    mask = np.isin(np.arange(70), [4, 31, 60])
+    found = np.asarray(jitted_graph(points, 9, mask))
+    for row in (4, 31, 60):
+        assert sorted(found[row].tolist()) == sorted([4, 31, 60] + [row] * 6)
+
+
+def test_the_graph_of_points_that_tie_holds_nearest_ones() -> None:
+    points = jnp.zeros((40, 3)).at[35:].set(1)
+    found = np.asarray(jitted_graph(points, 4))
+    assert (found[:35] < 35).all()
+    assert (found[35:] >= 35).all()
+    assert all(len(set(row)) == 4 for row in found.tolist())
+
+
+def test_vmap_of_the_graph_equals_a_loop() -> None:
+    points = jax.random.normal(jax.random.key(0), (4, 40, 3))
+    mask = jax.random.bernoulli(jax.random.key(1), 0.7, (4, 40))
+    batched = jax.jit(jax.vmap(lambda p, m: neighbor_graph(p, 5, m)))(points, mask)
+    for i in range(4):
+        np.testing.assert_array_equal(np.sort(batched[i]), np.sort(jitted_graph(points[i], 5, mask[i])))
+
+
+@pytest.mark.parametrize("k", [0, 4])
+def test_an_impossible_k_is_refused_of_the_graph(k: int) -> None:
+    with pytest.raises(ValueError, match=f"k = {k} neighbours"):
+        neighbor_graph(jnp.zeros((3, 3)), k)
