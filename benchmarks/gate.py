@@ -35,7 +35,7 @@ from benchmarks.stages import REFINED, small_crop
 from benchmarks.timing import compile_for, time_in_turn
 from kmn_jax.checks import InputError
 from kmn_jax.estimator.crop_pose import crop_pose
-from kmn_jax.geometry.knn import neighbor_graph, squared_distances
+from kmn_jax.geometry.knn import k_nearest, neighbor_graph, squared_distances
 from kmn_jax.models.normalization import released_object, released_scene
 from kmn_jax.report import print_table, write_json
 from tests.reference import dense_jax
@@ -65,8 +65,11 @@ def main(update: bool = False, repeats: int = 9, json: Path | None = None) -> in
         "network, cached object, over dense JAX": network_pair(case),
         "gradient of the network over dense JAX": gradient_pair(case),
         "pair head over dense JAX": head_pair(case),
-        "20 nearest of 2048 coordinates over one top_k": neighbor_pair(3),
-        "20 nearest of 2048 features over one top_k": neighbor_pair(64),
+        "graph of 2048 coordinates over one top_k": neighbor_pair(points_in_order(2048, 3), neighbor_graph),
+        "graph of 2048 features over one top_k": neighbor_pair(points_in_order(2048, 64), neighbor_graph),
+        "20 nearest of 2048 coordinates over one top_k": neighbor_pair(
+            jax.random.normal(jax.random.key(0), (2048, 3)), lambda x, k: k_nearest(x, x, k)
+        ),
         "crop to refined pose over a dense forward": pose_pair(case),
     }
     ratios = {name: times_faster(pair, repeats) for name, pair in pairs.items()}
@@ -152,11 +155,10 @@ def head_pair(case: Case) -> Pair:
     )
 
 
-def neighbor_pair(width: int) -> Pair:
-    """Exact neighbours of drawn points, in order as in the network."""
-    x = points_in_order(2048, width)
+def neighbor_pair(x: jax.Array, nearest: Callable[[jax.Array, int], jax.Array]) -> Pair:
+    """Exact neighbours of points (n, c) among themselves."""
     return Pair(
-        _ready(lambda x: neighbor_graph(x, 20), x), _ready(lambda x: jax.lax.top_k(-squared_distances(x, x), 20)[1], x)
+        _ready(lambda x: nearest(x, 20), x), _ready(lambda x: jax.lax.top_k(-squared_distances(x, x), 20)[1], x)
     )
 
 

@@ -90,8 +90,8 @@ def network_stages(case: Case) -> dict[str, Stage]:
         return neighbor_graph(x, count)
 
     calls = {"order of the points": of_network(ordered, released_scene(case.crops[0], None))}
-    cloud, _ = calls["order of the points"]()
-    x, graph, local = cloud, jnp.zeros(0), []
+    cloud, places = calls["order of the points"]()
+    x, local = cloud, []
     for block, searched in enumerate(("coordinates", "features, first", "features, second"), start=1):
         calls[f"kNN on {searched}"] = of_network(nearest, x if block > 1 else cloud[:, :3])
         graph = calls[f"kNN on {searched}"]()
@@ -103,7 +103,8 @@ def network_stages(case: Case) -> dict[str, Stage]:
     calls["global and output layers"] = of_network(
         lambda net, x: net.scene._with_global(x, "float32", None), jnp.concatenate(local, axis=1)
     )
-    scene, part = calls["global and output layers"](), encode_objects(*model, case)[0]
+    calls["points as given"] = of_network(lambda _, x, i: x[i], calls["global and output layers"](), places)
+    scene, part = calls["points as given"](), encode_objects(*model, case)[0]
     calls["pair head"] = of_network(lambda net, s, o: net.match(s, o), scene, part)
     return _joined(calls, work.scene_stages(config, points))
 

@@ -51,6 +51,11 @@ class Work(NamedTuple):
         return "arithmetic" if self.flops / ceilings.matmul_flops > self.moved / ceilings.copy_bytes else "memory"
 
 
+def order_of(points: int, inputs: int) -> Work:
+    """Move points and their features into an order, comparisons of the sort not counted; and where each has gone."""
+    return Work(0.0, _FLOAT * points * (2.0 * (3 + inputs) + 1))
+
+
 def neighbors(points: int, width: int, count: int, queries: int | None = None) -> Work:
     """All distances, of which the nearest are kept."""
     queries = queries or points
@@ -90,7 +95,7 @@ def scene_stages(config: KeyMatchNetConfig, points: int) -> dict[str, Work]:
     pairs = NUM_PAIR_INVARIANTS if invariant else 0
     count, width = min(config.num_neighbors, points), config.edge_width
     stages = {
-        "order of the points": Work(0.0, _FLOAT * points * (2.0 * _RAW + 1)),
+        "order of the points": order_of(points, inputs),
         "kNN on coordinates": neighbors(points, 3, count),
         "EdgeConv 1": edge_conv(points, count, inputs, width, 2, pairs),
         "kNN on features, first": neighbors(points, width, count),
@@ -98,6 +103,7 @@ def scene_stages(config: KeyMatchNetConfig, points: int) -> dict[str, Work]:
         "kNN on features, second": neighbors(points, width, count),
         "EdgeConv 3": edge_conv(points, count, width, width, 1),
         "global and output layers": global_layers(points, 3 * width, config.embedding_width, config.scene_width),
+        "points as given": Work(0.0, _FLOAT * points * (2.0 * config.scene_width + 1)),
         "pair head": pair_head(
             points, config.num_keypoints, config.scene_width, config.object_width, config.pair_width
         ),
@@ -111,7 +117,7 @@ def object_work(config: KeyMatchNetConfig) -> Work:
     invariant = config.inputs == "invariant"
     inputs, pairs = (NUM_OBJECT_INVARIANTS, NUM_PAIR_INVARIANTS) if invariant else (_RAW, 0)
     count = min(config.num_neighbors, points)
-    work = neighbors(points, 3, count) + edge_conv(points, count, inputs, width, 2, pairs)
+    work = order_of(points, inputs) + neighbors(points, 3, count) + edge_conv(points, count, inputs, width, 2, pairs)
     if config.graph == "dynamic":
         work = work + neighbors(points, width, count, keypoints)
     work = work + edge_conv(keypoints, count, width, width, 2) + edge_conv(keypoints, 1, width, width, 1)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 _COORDINATES = 3
 _CPU_PARTS = 32  # fewer than about ten ready operations XLA's CPU runtime keeps on one thread
-_CPU_ROWS = 16  # smaller parts take longer to compile than they save
+_CPU_ROWS = 16  # for fewer rows, fewer parts: these take longer to compile than they save
 
 
 def squared_distances(queries: Float[Array, "n c"], points: Float[Array, "m c"]) -> Float[Array, "n m"]:
@@ -55,15 +55,16 @@ def k_nearest(
 def neighbor_graph(points: Float[Array, "n c"], k: int, mask: Bool[Array, " n"] | None = None) -> Int[Array, "n k"]:
     """Return for each point its k nearest among all of them, itself included: `k_nearest`, but for ties.
 
-    On CPUs it is faster the nearer points of similar index are (see `space_filling_order`): a row's selection starts
-    at its own index, and the sooner it meets the nearest, the fewer others it keeps for a while. Ties go to either.
+    On CPUs it is faster the nearer points of similar index are (see `space_filling_order`): a point's selection starts
+    with those of about its own index, and the sooner it meets the nearest, the fewer others it keeps for a while.
+    Which of several equally far points is found depends on the device and on n, padding included.
     """
     _check_k(k, points.shape[0])
     points, _ = _centered(points, points, mask)
     selected = jax.lax.platform_dependent(
         points,
         mask,
-        cpu=partial(_k_smallest_from_own_index, k=k),
+        cpu=partial(_k_smallest_own_part_first, k=k),
         default=lambda points, mask: _k_smallest(points, points, mask, k),
     )
     return _repeat_nearest(*selected)
@@ -109,21 +110,21 @@ def _part_size(rows: int) -> int:
     return max(-(-rows // _CPU_PARTS), _CPU_ROWS)
 
 
-def _k_smallest_from_own_index(
+def _k_smallest_own_part_first(
     points: Float[Array, "n c"], mask: Bool[Array, " n"] | None, k: int
 ) -> tuple[Float[Array, "n k"], Int[Array, "n k"]]:
     """The same for points among themselves: each part meets its own points first, then those after, then before.
 
-    XLA's `top_k` on CPUs passes the candidates once and keeps a heap of the k smallest so far.
+    XLA's `top_k` on CPUs passes the candidates once and keeps those that are the k smallest so far.
     """
     count = points.shape[0]
     size = _part_size(count)
-    twice = jax.lax.optimization_barrier(jnp.concatenate([points, points]))
+    twice = jnp.concatenate([points, points])
     mask_twice = None if mask is None else jnp.concatenate([mask, mask])
     starts = range(0, count, size)
     parts = [
         _k_smallest(
-            points[i : i + size], twice[i : i + count], None if mask_twice is None else mask_twice[i:][:count], k
+            points[i : i + size], twice[i : i + count], None if mask_twice is None else mask_twice[i : i + count], k
         )
         for i in starts
     ]

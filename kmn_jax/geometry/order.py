@@ -16,12 +16,11 @@ def space_filling_order(
     `points[order]` are in order, masked points last; `points[order][places]` are the points again. All but masked
     points must be finite. Points of one of the cube's 1024^3 cells keep their order.
     """
-    code = _code(points, mask)
-    order = jnp.argsort(code)
+    order = jnp.argsort(_codes(points, mask))
     return order, jnp.zeros_like(order).at[order].set(jnp.arange(order.shape[0], dtype=order.dtype))
 
 
-def _code(points: Float[Array, "n 3"], mask: Bool[Array, " n"] | None) -> UInt[Array, " n"]:
+def _codes(points: Float[Array, "n 3"], mask: Bool[Array, " n"] | None) -> UInt[Array, " n"]:
     real = jnp.ones(points.shape[0], dtype=bool) if mask is None else mask
     kept = real[:, None]
     lowest = jnp.where(kept, points, jnp.inf).min(axis=0, keepdims=True, initial=jnp.inf)
@@ -29,8 +28,8 @@ def _code(points: Float[Array, "n 3"], mask: Bool[Array, " n"] | None) -> UInt[A
     side = (highest - lowest).max()
     share = jnp.where(kept, points - lowest, 0) / jnp.where(side > 0, side, 1)
     cells = jnp.minimum(share * 2**_BITS, 2**_BITS - 1).astype(jnp.uint32)
-    codes = _two_zeros_after_each_bit(cells)
-    code = codes[:, 0] | (codes[:, 1] << 1) | (codes[:, 2] << 2)
+    spread = _two_zeros_after_each_bit(cells)
+    code = spread[:, 0] | (spread[:, 1] << 1) | (spread[:, 2] << 2)
     return jnp.where(real, code, jnp.uint32(2 ** (3 * _BITS)))
 
 

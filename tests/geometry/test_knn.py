@@ -143,7 +143,7 @@ def test_no_queries_have_no_neighbours() -> None:
 
 
 @pytest.mark.parametrize("width", [3, 64])
-@pytest.mark.parametrize("count", [9, 33, 70, 200])
+@pytest.mark.parametrize("count", [9, 33, 70, 530])
 def test_the_graph_is_each_points_nearest(count: int, width: int) -> None:
     _, points = clouds(count, 1, count, width)
     found = np.asarray(jitted_graph(points, 9))
@@ -151,9 +151,10 @@ def test_the_graph_is_each_points_nearest(count: int, width: int) -> None:
     assert (found == np.arange(count)[:, None]).any(axis=1).all()
 
 
+@pytest.mark.parametrize("width", [3, 64])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_in_the_graph_padding_is_never_found_whatever_it_holds(seed: int) -> None:
-    _, points = clouds(seed, 1, 70, 3)
+def test_in_the_graph_padding_is_never_found_whatever_it_holds(seed: int, width: int) -> None:
+    _, points = clouds(seed, 1, 70, width)
     mask = np.arange(70) % 3 != 0
     padded = np.where(mask[:, None], points, np.nan).astype(np.float32)
     found = np.asarray(jitted_graph(padded, 9, mask))
@@ -166,6 +167,11 @@ def test_in_the_graph_of_fewer_real_points_than_k_each_repeats_itself() -> None:
     found = np.asarray(jitted_graph(points, 9, mask))
     for row in (4, 31, 60):
         assert sorted(found[row].tolist()) == sorted([4, 31, 60] + [row] * 6)
+
+
+def test_the_graph_without_real_points_stays_within_the_list() -> None:
+    found = np.asarray(jitted_graph(np.full((70, 3), np.nan, dtype=np.float32), 9, np.zeros(70, dtype=bool)))
+    assert ((found >= 0) & (found < 70)).all()
 
 
 def test_the_graph_of_points_that_tie_holds_nearest_ones() -> None:

@@ -49,6 +49,20 @@ def test_points_that_coincide_keep_their_order(count: int) -> None:
     np.testing.assert_array_equal(jitted(np.full((count, 3), 5, dtype=np.float32))[0], np.arange(count))
 
 
+@pytest.mark.parametrize("size", [1e-44, 1e-30, 1e30, 1e38])
+def test_clouds_of_any_size_have_an_order(size: float) -> None:
+    points = (np.random.default_rng(3).uniform(-1, 1, (50, 3)) * size).astype(np.float32)
+    order, _ = jitted(points)
+    np.testing.assert_array_equal(np.sort(order), np.arange(50))
+
+
+def test_vmap_equals_a_loop() -> None:
+    points = jax.random.normal(jax.random.key(4), (3, 40, 3))
+    masks = jnp.arange(40)[None, :] < jnp.array([40, 25, 0])[:, None]
+    for together, points_i, mask in zip(jax.vmap(jitted)(points, masks)[0], points, masks, strict=True):
+        np.testing.assert_array_equal(together, jitted(points_i, mask)[0])
+
+
 def test_without_real_points_there_is_still_an_order() -> None:
     order, places = jitted(np.full((5, 3), np.nan, dtype=np.float32), np.zeros(5, dtype=bool))
     np.testing.assert_array_equal(order, np.arange(5))

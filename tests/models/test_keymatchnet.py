@@ -79,6 +79,15 @@ def test_padded_crop_equals_the_unpadded_one(inputs: str, real: int) -> None:
     assert all(np.isfinite(x).all() for x in got)
 
 
+def test_padding_may_lie_between_real_points() -> None:
+    model = small_model(normalization="metric", inputs="invariant")
+    crop, cloud = scene_crop(1, 300), box_cloud(11, 280)
+    mask = np.arange(300) % 3 != 1
+    want = logits(model, crop[mask], cloud, 50.0)
+    crop[~mask] = np.inf
+    assert_close([x[mask] for x in logits(model, crop, cloud, 50.0, mask)], want)
+
+
 def test_released_normalisation_ignores_padding_too() -> None:
     model = small_model(normalization="released")
     crop, cloud = scene_crop(2, 300), box_cloud(12, 280)
