@@ -23,15 +23,13 @@ from flax import nnx
 
 from benchmarks.network_cases import (
     Case,
-    cached_forward,
     dense_jax_forward,
-    encode_objects,
     head_features,
     make_case,
     match,
     points_in_order,
 )
-from benchmarks.stages import REFINED, small_crop
+from benchmarks.stages import REFINED, network_call, small_crop
 from benchmarks.timing import compile_for, time_in_turn
 from kmn_jax.checks import InputError
 from kmn_jax.estimator.crop_pose import crop_pose
@@ -115,12 +113,7 @@ def compared(ratios: Mapping[str, float], baseline: Mapping[str, float]) -> tupl
 
 def network_pair(case: Case) -> Pair:
     """The scene branch and the pair head, beside all branches: the dense form caches nothing."""
-    graphdef = case.model.graphdef
-    parts = encode_objects(graphdef, case.parameters, case)
-    return Pair(
-        _ready(partial(cached_forward, graphdef), case.parameters, case.crops, parts),
-        _ready(dense_jax_forward, case),
-    )
+    return Pair(network_call(case), _ready(dense_jax_forward, case))
 
 
 def gradient_pair(case: Case) -> Pair:

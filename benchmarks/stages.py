@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from benchmarks import training, work
-from benchmarks.network_cases import Case, encode_objects
+from benchmarks.network_cases import Case, cached_forward, encode_objects
 from benchmarks.timing import compile_for
 from benchmarks.work import Work
 from configs import find_config
@@ -71,6 +72,13 @@ def small_crop() -> SmallCrop:
     model = load_pretrained("small")
     found, case = small_case()
     return SmallCrop(model, arrays_of(model, make_part(found, model)), padded(case.points))
+
+
+def network_call(case: Case) -> Callable[[], Any]:
+    """Return the scene branch and the pair head in one call, with the features of a case's objects given."""
+    model = case.model
+    arguments = model.parameters, case.crops, encode_objects(*model, case)
+    return partial(compile_for(partial(cached_forward, model.graphdef), *arguments).function, *arguments)
 
 
 def network_stages(case: Case) -> dict[str, Stage]:
