@@ -13,11 +13,13 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, UInt
 
 from kmn_jax.models.layers import Compute, NormalizedLinear, channel_moments, drawn_kernel, dropout, leaky_relu, product
 
 PairDropout = Literal["shared", "per_pair"]
+
+_WORD = 32  # keypoints whose dropout is in one word
 
 # What padded rows get: certain background, and no preference among keypoints.
 _PADDED_SEGMENTATION = (0.0, -1e4)
@@ -122,12 +124,49 @@ def _per_pair(
     u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, " c"], rate: float, key: jax.Array
 ) -> tuple[Float[Array, "n c"], Float[Array, "n k"]]:
     """Return pooled features and keypoint logits under the published dropout of every pair on its own."""
+    pooled, logits = jnp.full_like(u, -jnp.inf), []
+    for start in range(0, v.shape[0], _WORD):
+        some = v[start : start + _WORD]
+        pooled, found = _per_pair_of_word(pooled, u, some, weights, rate, jax.random.fold_in(key, start))
+        logits.append(found)
+    return pooled, jnp.concatenate(logits, axis=1)
 
-    @jax.checkpoint
+
+def _per_pair_of_word(
+    pooled: Float[Array, "n c"],
+    u: Float[Array, "n c"],
+    v: Float[Array, "k c"],
+    weights: Float[Array, " c"],
+    rate: float,
+    key: jax.Array,
+) -> tuple[Float[Array, "n c"], Float[Array, "n k"]]:
+    """Go on with up to 32 keypoints."""
+    kept = kept_pairs(key, rate, u.shape, v.shape[0])
+
+    @jax.checkpoint  # the backward pass recomputes all but the random bits
     def one(best: Float[Array, "n c"], inputs: tuple) -> tuple[Float[Array, "n c"], Float[Array, " n"]]:
-        v_k, key_k = inputs
-        activated = dropout(leaky_relu(u + v_k[None, :]), rate, key_k)
+        v_k, k = inputs
+        activated = jnp.where((kept >> k) & 1 == 1, leaky_relu(u + v_k[None, :]) / (1 - rate), 0)
         return jnp.maximum(best, activated), (activated * weights[None, :]).sum(axis=1)
 
-    pooled, logits = jax.lax.scan(one, jnp.full_like(u, -jnp.inf), (v, jax.random.split(key, v.shape[0])))
+    pooled, logits = jax.lax.scan(one, pooled, (v, jnp.arange(v.shape[0], dtype=jnp.uint32)))
     return pooled, logits.T
+
+
+def kept_pairs(key: jax.Array, rate: float, shape: tuple[int, int], count: int) -> UInt[Array, "n c"]:
+    """Return for each point and channel a word of which bit k is set where dropout at `rate` keeps keypoint k.
+
+    Up to 32 keypoints, two from each 32 random bits, so that the rate is one of 65,536. In this form the backward
+    pass need not draw them again, which takes CPUs longer than all else in the head.
+    """
+    dropped = jnp.uint32(min(round(rate * 2**16), 2**16 - 1))
+
+    def two(word: UInt[Array, "n c"], inputs: tuple) -> tuple[UInt[Array, "n c"], None]:
+        key_i, place = inputs
+        bits = jax.random.bits(key_i, shape, jnp.uint32)
+        low, high = ((half >= dropped).astype(jnp.uint32) for half in (bits & 0xFFFF, bits >> 16))
+        return word | (low << place) | (high << (place + 1)), None
+
+    pairs = -(-count // 2)
+    places = 2 * jnp.arange(pairs, dtype=jnp.uint32)
+    return jax.lax.scan(two, jnp.zeros(shape, dtype=jnp.uint32), (jax.random.split(key, pairs), places))[0]

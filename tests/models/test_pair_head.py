@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from kmn_jax.models.pair_head import PairHead, pairwise_absolute_fused, pairwise_absolute_scan, pairwise_leaky_sum
+from kmn_jax.models.pair_head import (
+    PairHead,
+    kept_pairs,
+    pairwise_absolute_fused,
+    pairwise_absolute_scan,
+    pairwise_leaky_sum,
+)
 from tests.models.test_layers import signed_layer
 from tests.reference import dense_jax
 
@@ -111,3 +117,45 @@ def test_dropout_is_unbiased_and_keyed(kind) -> None:
     a, b, c = (head(scene, part, "float32", None, 0.4, kind, jax.random.key(seed))[1] for seed in (0, 0, 1))
     assert bool((a == b).all())
     assert not bool((a == c).all())
+
+
+def bits_of(words: jax.Array, count: int) -> np.ndarray:
+    return (np.asarray(words)[None] >> np.arange(count)[:, None, None]) & 1
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.4, 0.9])
+def test_pairs_are_kept_at_the_rate_and_independently(rate: float) -> None:
+    kept = bits_of(kept_pairs(jax.random.key(0), rate, (250, 40), 32), 32).reshape(32, -1)
+    deviation = (rate * (1 - rate) / kept.shape[1]) ** 0.5
+    assert np.abs(kept.mean(axis=1) - (1 - rate)).max() <= 5 * deviation
+    if rate > 0:
+        correlation = np.corrcoef(kept) - np.eye(32)
+        assert np.abs(correlation).max() < 5 / kept.shape[1] ** 0.5
+
+
+@pytest.mark.parametrize("keypoints", [5, 32, 37])
+def test_dropout_of_every_pair_is_the_dense_one_with_the_same_pairs(keypoints: int) -> None:
+    from kmn_jax.models.pair_head import _per_pair
+
+    rng = np.random.default_rng(3)
+    u, v, w = (jnp.asarray(rng.normal(size=shape), "f4") for shape in [(30, 16), (keypoints, 16), (16,)])
+    key = jax.random.key(7)
+    words = [
+        bits_of(kept_pairs(jax.random.fold_in(key, start), 0.4, (30, 16), min(32, keypoints - start)), 32)
+        for start in range(0, keypoints, 32)
+    ]
+    kept = jnp.asarray(np.concatenate(words)[:keypoints], "f4").transpose(1, 0, 2)
+
+    def dense(u: jax.Array, v: jax.Array, w: jax.Array) -> tuple[jax.Array, jax.Array]:
+        z = u[:, None] + v[None]
+        activated = kept * jnp.where(z >= 0, z, 0.2 * z) / 0.6
+        return activated.max(axis=1), (activated * w[None, None, :]).sum(axis=2)
+
+    def scalar(outputs: tuple[jax.Array, jax.Array]) -> jax.Array:
+        return (outputs[0] ** 2).sum() + (outputs[1] ** 3).sum()
+
+    for got, want in zip(_per_pair(u, v, w, 0.4, key), dense(u, v, w), strict=True):
+        np.testing.assert_allclose(got, want, atol=2e-5)
+    got = jax.grad(lambda *x: scalar(_per_pair(*x, 0.4, key)), argnums=(0, 1, 2))(u, v, w)
+    for a, b in zip(got, jax.grad(lambda *x: scalar(dense(*x)), argnums=(0, 1, 2))(u, v, w), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * float(jnp.abs(b).max()))
