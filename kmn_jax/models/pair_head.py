@@ -153,7 +153,7 @@ def _per_pair_of_word(
     return pooled, logits.T
 
 
-def kept_pairs(key: jax.Array, rate: float, shape: tuple[int, int], count: int) -> UInt[Array, "n c"]:
+def kept_pairs(key: jax.Array, rate: float, shape: tuple[int, ...], count: int) -> UInt[Array, "n c"]:
     """Return for each point and channel a word of which bit k is set where dropout at `rate` keeps keypoint k.
 
     Up to 32 keypoints, two from each 32 random bits, so that the rate is one of 65,536. In this form the backward
