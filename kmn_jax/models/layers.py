@@ -22,12 +22,12 @@ from jaxtyping import Array, Bool, Float
 Compute = Literal["float32", "tf32", "bfloat16"]
 
 _EPSILON = 1e-5
-_LEAK = 0.2
+LEAK = 0.2
 
 
 def leaky_relu(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return x, or 0.2 x where that is negative."""
-    return jnp.where(x >= 0, x, _LEAK * x)
+    return jnp.where(x >= 0, x, LEAK * x)
 
 
 def product(x: Float[Array, "... i"], kernel: Float[Array, "i o"], compute: Compute) -> Float[Array, "... o"]:
@@ -127,7 +127,7 @@ def _image_forward(x: Array, scale: Array, shift: Array, leaky: bool) -> tuple[A
 def _image_backward(leaky: bool, saved: Any, cotangent: Array) -> tuple[Array, Array, Array]:
     x, scale, shift = saved
     if leaky:
-        cotangent = jnp.where(_image(x, scale, shift, False) >= 0, cotangent, _LEAK * cotangent)
+        cotangent = jnp.where(_image(x, scale, shift, False) >= 0, cotangent, LEAK * cotangent)
     # As rows: over several axes XLA's CPU compiler does not vectorise the sum.
     rows, of_rows = x.astype(jnp.float32).reshape(-1, x.shape[-1]), cotangent.reshape(-1, x.shape[-1])
     zeros = jnp.float32(0), jnp.float32(0)

@@ -8,14 +8,24 @@ separates too and the rest is reduced over c without being stored.
 
 from __future__ import annotations
 
-from typing import Literal
+from functools import partial, reduce
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Bool, Float, UInt
 
-from kmn_jax.models.layers import Compute, NormalizedLinear, channel_moments, drawn_kernel, dropout, leaky_relu, product
+from kmn_jax.models.layers import (
+    LEAK,
+    Compute,
+    NormalizedLinear,
+    channel_moments,
+    drawn_kernel,
+    dropout,
+    leaky_relu,
+    product,
+)
 
 PairDropout = Literal["shared", "per_pair"]
 
@@ -124,40 +134,68 @@ def _per_pair(
     u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, " c"], rate: float, key: jax.Array
 ) -> tuple[Float[Array, "n c"], Float[Array, "n k"]]:
     """Return pooled features and keypoint logits under the published dropout of every pair on its own."""
-    pooled, logits = jnp.full_like(u, -jnp.inf), []
+    found = []
     for start in range(0, v.shape[0], _WORD):
         some = v[start : start + _WORD]
-        pooled, found = _per_pair_of_word(pooled, u, some, weights, rate, jax.random.fold_in(key, start))
-        logits.append(found)
-    return pooled, jnp.concatenate(logits, axis=1)
+        kept = kept_pairs(jax.random.fold_in(key, start), rate, u.shape, some.shape[0])
+        found.append(_of_kept_pairs(u, some, weights, kept, rate))
+    pooled, logits = zip(*found, strict=True)
+    return reduce(jnp.maximum, pooled), jnp.concatenate(logits, axis=1)
 
 
-def _per_pair_of_word(
-    pooled: Float[Array, "n c"],
-    u: Float[Array, "n c"],
-    v: Float[Array, "k c"],
-    weights: Float[Array, " c"],
-    rate: float,
-    key: jax.Array,
+@partial(jax.custom_vjp, nondiff_argnums=(4,))
+def _of_kept_pairs(
+    u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, " c"], kept: UInt[Array, "n c"], rate: float
 ) -> tuple[Float[Array, "n c"], Float[Array, "n k"]]:
-    """Go on with up to 32 keypoints."""
-    kept = kept_pairs(key, rate, u.shape, v.shape[0])
+    """Return the maximum over keypoints and the weighted sums over channels of what is kept of leaky(u_n + v_k)."""
+    return _of_kept_pairs_forward(u, v, weights, kept, rate)[0]
 
-    @jax.checkpoint  # the backward pass recomputes all but the random bits
-    def one(best: Float[Array, "n c"], inputs: tuple) -> tuple[Float[Array, "n c"], Float[Array, " n"]]:
+
+def _of_kept_pairs_forward(u: Array, v: Array, weights: Array, kept: Array, rate: float) -> tuple[Any, Any]:
+    def one(best: tuple[Array, Array], inputs: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
         v_k, k = inputs
-        activated = jnp.where((kept >> k) & 1 == 1, leaky_relu(u + v_k[None, :]) / (1 - rate), 0)
-        return jnp.maximum(best, activated), (activated * weights[None, :]).sum(axis=1)
+        activated = _if_kept(kept, k, leaky_relu(u + v_k[None, :]), rate)
+        larger = activated > best[0]
+        best = jnp.where(larger, activated, best[0]), jnp.where(larger, k, best[1])
+        return best, jnp.matmul(activated, weights, precision=jax.lax.Precision.HIGHEST)
 
-    pooled, logits = jax.lax.scan(one, pooled, (v, jnp.arange(v.shape[0], dtype=jnp.uint32)))
-    return pooled, logits.T
+    none = jnp.full_like(u, -jnp.inf), jnp.zeros_like(kept)
+    (pooled, first_best), logits = jax.lax.scan(one, none, (v, jnp.arange(v.shape[0], dtype=jnp.uint32)))
+    return (pooled, logits.T), (u, v, weights, kept, first_best)
+
+
+def _of_kept_pairs_backward(rate: float, saved: Any, cotangent: tuple[Array, Array]) -> tuple[Any, ...]:
+    """Go through the keypoints once more, which stores no maximum of each."""
+    u, v, weights, kept, first_best = saved
+    of_pooled, of_logits = cotangent
+
+    def one(total: tuple[Array, Array], inputs: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], Array]:
+        v_k, of_logits_k, k = inputs
+        z = u + v_k[None, :]
+        activated = _if_kept(kept, k, leaky_relu(z), rate)
+        change = of_logits_k[:, None] * weights[None, :] + jnp.where(first_best == k, of_pooled, 0)
+        change = _if_kept(kept, k, jnp.where(z >= 0, change, LEAK * change), rate)
+        of_weights = jnp.matmul(of_logits_k, activated, precision=jax.lax.Precision.HIGHEST)
+        return (total[0] + change, total[1] + of_weights), change.sum(axis=0)
+
+    places = jnp.arange(v.shape[0], dtype=jnp.uint32)
+    zeros = jnp.zeros_like(u), jnp.zeros_like(weights)
+    (of_u, of_weights), of_v = jax.lax.scan(one, zeros, (v, of_logits.T, places))
+    return of_u, of_v, of_weights, None
+
+
+def _if_kept(kept: UInt[Array, "n c"], k: UInt[Array, ""], x: Float[Array, "n c"], rate: float) -> Float[Array, "n c"]:
+    return jnp.where((kept >> k) & 1 == 1, x / (1 - rate), 0)
+
+
+_of_kept_pairs.defvjp(_of_kept_pairs_forward, _of_kept_pairs_backward)
 
 
 def kept_pairs(key: jax.Array, rate: float, shape: tuple[int, ...], count: int) -> UInt[Array, "n c"]:
     """Return for each point and channel a word of which bit k is set where dropout at `rate` keeps keypoint k.
 
-    Up to 32 keypoints, two from each 32 random bits, so that the rate is one of 65,536. In this form the backward
-    pass need not draw them again, which takes CPUs longer than all else in the head.
+    Up to 32 keypoints, two from each 32 random bits, so that the rate is one of 65,536. In this form they can be kept
+    for the backward pass, which need not draw them again.
     """
     dropped = jnp.uint32(min(round(rate * 2**16), 2**16 - 1))
 
