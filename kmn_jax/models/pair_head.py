@@ -30,6 +30,7 @@ from kmn_jax.models.layers import (
 PairDropout = Literal["shared", "per_pair"]
 
 _WORD = 32  # keypoints whose dropout is in one word
+_RATES = 2**16
 
 # What padded rows get: certain background, and no preference among keypoints.
 _PADDED_SEGMENTATION = (0.0, -1e4)
@@ -134,7 +135,7 @@ def _per_pair(
     u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, " c"], rate: float, key: jax.Array
 ) -> tuple[Float[Array, "n c"], Float[Array, "n k"]]:
     """Return pooled features and keypoint logits under the published dropout of every pair on its own."""
-    found = []
+    rate, found = _rounded(rate), []
     for start in range(0, v.shape[0], _WORD):
         some = v[start : start + _WORD]
         kept = kept_pairs(jax.random.fold_in(key, start), rate, u.shape, some.shape[0])
@@ -155,7 +156,7 @@ def _of_kept_pairs_forward(u: Array, v: Array, weights: Array, kept: Array, rate
     def one(best: tuple[Array, Array], inputs: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
         v_k, k = inputs
         activated = _if_kept(kept, k, leaky_relu(u + v_k[None, :]), rate)
-        larger = activated > best[0]
+        larger = ~(best[0] >= activated) & ~jnp.isnan(best[0])  # what is not a number stays in the maximum
         best = jnp.where(larger, activated, best[0]), jnp.where(larger, k, best[1])
         return best, jnp.matmul(activated, weights, precision=jax.lax.Precision.HIGHEST)
 
@@ -191,13 +192,18 @@ def _if_kept(kept: UInt[Array, "n c"], k: UInt[Array, ""], x: Float[Array, "n c"
 _of_kept_pairs.defvjp(_of_kept_pairs_forward, _of_kept_pairs_backward)
 
 
+def _rounded(rate: float) -> float:
+    """Return the nearest rate below 1 that 16 random bits can have."""
+    return min(round(rate * _RATES), _RATES - 1) / _RATES
+
+
 def kept_pairs(key: jax.Array, rate: float, shape: tuple[int, ...], count: int) -> UInt[Array, "n c"]:
     """Return for each point and channel a word of which bit k is set where dropout at `rate` keeps keypoint k.
 
     Up to 32 keypoints, two from each 32 random bits, so that the rate is one of 65,536. In this form they can be kept
     for the backward pass, which need not draw them again.
     """
-    dropped = jnp.uint32(min(round(rate * 2**16), 2**16 - 1))
+    dropped = jnp.uint32(_rounded(rate) * _RATES)
 
     def two(word: UInt[Array, "n c"], inputs: tuple) -> tuple[UInt[Array, "n c"], None]:
         key_i, place = inputs

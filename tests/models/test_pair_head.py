@@ -73,11 +73,13 @@ def test_pairwise_leaky_sum() -> None:
     np.testing.assert_allclose(pairwise_leaky_sum(jnp.asarray(u), jnp.asarray(v), jnp.asarray(w)), want, atol=2e-5)
 
 
-def test_no_pair_tensor_is_stored_in_either_direction() -> None:
+@pytest.mark.parametrize("kind", [None, "shared", "per_pair"])
+def test_no_pair_tensor_is_stored_in_either_direction(kind) -> None:
     head, (scene, part) = signed_head(0), features(0, n=2048, k=64)
+    drop = () if kind is None else (None, 0.4, kind, jax.random.key(0))
 
     def loss(s: jax.Array) -> jax.Array:
-        return sum(jnp.sum(x**2) for x in head(s, part, "float32"))
+        return sum(jnp.sum(x**2) for x in head(s, part, "float32", *drop))
 
     memory = jax.jit(jax.grad(loss)).lower(scene).compile().memory_analysis()
     assert memory.temp_size_in_bytes < 2048 * 64 * 32 * 4 / 2
@@ -119,6 +121,15 @@ def test_dropout_is_unbiased_and_keyed(kind) -> None:
     assert not bool((a == c).all())
 
 
+def test_dropout_of_every_pair_hides_no_number_that_is_none() -> None:
+    from kmn_jax.models.pair_head import _per_pair
+
+    u = jnp.zeros((4, 8)).at[1].set(jnp.nan)
+    pooled, logits = _per_pair(u, jnp.ones((32, 8)), jnp.ones(8), 0.4, jax.random.key(0))
+    assert np.isnan(pooled).all(axis=1).tolist() == [False, True, False, False]
+    assert np.isnan(logits).any(axis=1).tolist() == [False, True, False, False]
+
+
 def bits_of(words: jax.Array, count: int) -> np.ndarray:
     return (np.asarray(words)[None] >> np.arange(count)[:, None, None]) & 1
 
@@ -148,7 +159,7 @@ def test_dropout_of_every_pair_is_the_dense_one_with_the_same_pairs(keypoints: i
 
     def dense(u: jax.Array, v: jax.Array, w: jax.Array) -> tuple[jax.Array, jax.Array]:
         z = u[:, None] + v[None]
-        activated = kept * jnp.where(z >= 0, z, 0.2 * z) / 0.6
+        activated = kept * jnp.where(z >= 0, z, 0.2 * z) / (1 - round(0.4 * 2**16) / 2**16)
         return activated.max(axis=1), (activated * w[None, None, :]).sum(axis=2)
 
     def scalar(outputs: tuple[jax.Array, jax.Array]) -> jax.Array:
