@@ -77,8 +77,8 @@ def initialize_distributed(
 def split_cpu(shares: int) -> None:
     """Make every core of a CPU a device of its own, or as many as can take equal numbers of so many shares of a batch.
 
-    Two devices of a core each are nearly twice as fast as one of two cores. Call it before JAX is used for anything
-    else. Other accelerators are what they are; so are devices that XLA_FLAGS or a setting of JAX asks for.
+    Two devices of a core each make more samples than one of two cores (docs/throughput.md). Call it before JAX is used
+    for anything else. Other accelerators are what they are; so are devices that XLA_FLAGS or a setting of JAX asks for.
     """
     flag = "xla_force_host_platform_device_count"
     if flag in os.environ.get("XLA_FLAGS", "") or jax.config.values["jax_num_cpu_devices"] > 0:
