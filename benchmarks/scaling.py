@@ -240,6 +240,8 @@ def _plot(series: Sequence[tuple[Sweep, list[float], Growth]]) -> bytes:
         axes.loglog(sizes, memory, "s:", ms=4, lw=1, color="C1")
         axes.set_title(sweep.what, fontsize=10)
         axes.set_xlabel(sweep.size)
+        axes.minorticks_off()
+        axes.set_xticks(sizes, [str(size) for size in sizes])
         axes.grid(alpha=0.3)
     figure.axes[0].set_ylabel("ms (blue), temporary MB (orange)")
     return as_png(canvas)
