@@ -121,16 +121,14 @@ def _k_smallest_own_part_first(
     size = _part_size(count)
     twice = jnp.concatenate([points, points])
     mask_twice = None if mask is None else jnp.concatenate([mask, mask])
-    starts = range(0, count, size)
     parts = [
         _k_smallest(
             points[i : i + size], twice[i : i + count], None if mask_twice is None else mask_twice[i : i + count], k
         )
-        for i in starts
+        for i in range(0, count, size)
     ]
     values, after_start = (jnp.concatenate(each) for each in zip(*parts, strict=True))
-    start = jnp.arange(count, dtype=jnp.int32)[:, None] // size * size
-    indices = after_start + start
+    indices = after_start + jnp.arange(count, dtype=jnp.int32)[:, None] // size * size
     return values, jnp.where(indices < count, indices, indices - count)
 
 
