@@ -33,13 +33,10 @@ from experiments.evaluation.rivals import missing
 from experiments.evaluation.scores import pair_errors
 from experiments.evaluation.sources import bop_objects
 from experiments.evaluation.tuned import RIVALS
-from kmn_jax.data.cad import ObjectModel
-from kmn_jax.data.splat import intrinsics
-from kmn_jax.estimator import PoseEstimator
-from kmn_jax.estimator.bin_poses import BinPosesConfig, bin_part, bin_poses
-from kmn_jax.estimator.crop_pose import crop_pose
-from kmn_jax.estimator.evidence import Sight
+from kmn_jax.detection import BinPosesConfig, PoseEstimator, Sight, bin_part, bin_poses, crop_pose
+from kmn_jax.geometry import intrinsics
 from kmn_jax.models import Model
+from kmn_jax.objects import ObjectModel
 from kmn_jax.report import print_table, write_json
 
 _RIVAL = "FPFH + RANSAC"

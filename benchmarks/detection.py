@@ -17,9 +17,9 @@ import tyro
 from tqdm import tqdm
 
 from experiments.bins import bin_images
-from kmn_jax.data.scan_files import Scan
-from kmn_jax.estimator import Part, PoseEstimator
-from kmn_jax.estimator.scene import Scene
+from kmn_jax.detection import PoseEstimator, Scene
+from kmn_jax.io import Scan
+from kmn_jax.objects import Part
 from kmn_jax.report import print_table, write_json
 
 

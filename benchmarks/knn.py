@@ -18,7 +18,7 @@ import tyro
 
 from benchmarks.network_cases import points_in_order
 from benchmarks.timing import compile_for, time_in_turn
-from kmn_jax.geometry.knn import k_nearest, neighbor_graph, squared_distances
+from kmn_jax.geometry import k_nearest, neighbor_graph, squared_distances
 from kmn_jax.report import print_table, write_json
 
 

@@ -28,7 +28,7 @@ from benchmarks.network_cases import (
     torch_forward,
 )
 from benchmarks.timing import Compiled, compile_for, time_in_turn
-from kmn_jax.models.layers import Compute
+from kmn_jax.models import Compute
 from kmn_jax.report import print_table, write_json
 from tests.reference import dense_jax
 

@@ -13,10 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from kmn_jax.geometry.order import space_filling_order
-from kmn_jax.models import RELEASED_CONFIG, Model, create_model, model_structure, save_released
-from kmn_jax.models.layers import Compute
-from kmn_jax.models.normalization import released_object, released_scene
+from kmn_jax.geometry import space_filling_order
+from kmn_jax.models import (
+    RELEASED_CONFIG,
+    Compute,
+    Model,
+    create_model,
+    model_structure,
+    released_object,
+    released_scene,
+    save_released,
+)
 from tests.reference import dense_jax
 
 

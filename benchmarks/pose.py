@@ -19,13 +19,7 @@ import tyro
 
 from benchmarks.synthetic import box_surface, synthetic_matches
 from benchmarks.timing import compile_for, time_in_turn
-from kmn_jax.geometry.se3 import (
-    from_rotation_translation,
-    pose_error,
-    random_rotation,
-    rotate_vectors,
-    transform_points,
-)
+from kmn_jax.geometry import from_rotation_translation, pose_error, random_rotation, rotate_vectors, transform_points
 from kmn_jax.pose import IcpConfig, Matches, RansacConfig, icp, kabsch, ransac
 from kmn_jax.report import print_table, write_json
 

@@ -27,12 +27,12 @@ from benchmarks.timing import Compiled, compile_for, time_in_turn
 from benchmarks.training import of_batch, throughput_rows
 from configs import find_config
 from experiments.evaluation.plots import as_png, new_figure
-from kmn_jax.estimator.part import arrays_of, make_part, save_part
-from kmn_jax.estimator.search import SearchConfig, crop_features, search, seed_keys, spread_seeds
+from kmn_jax.detection import SearchConfig, crop_features, search, seed_keys, spread_seeds
 from kmn_jax.models import load_pretrained
+from kmn_jax.objects import arrays_of, make_part, save_part
 from kmn_jax.pose import RansacConfig, ransac
 from kmn_jax.report import print_table, write_json
-from kmn_jax.train.sharding import split_cpu
+from kmn_jax.train import split_cpu
 
 _CELLS, _SCAN_EVERY, _SCAN_SEEDS = 1000, 10, 16  # a fleet: robots, seconds a pick, crops of a scan
 _OBJECTS = 10_000  # of a catalogue

@@ -16,13 +16,20 @@ import numpy as np
 import tyro
 
 from benchmarks.timing import compile_for, time_in_turn
-from kmn_jax.data.crops import Crop, CropConfig, NormalSource, draw_crop
-from kmn_jax.data.device_pack import DevicePack, stack_pack, take_scene, visible_points
-from kmn_jax.data.pack import Pack
-from kmn_jax.data.splat import SplatConfig, VisiblePoints
-from kmn_jax.geometry import estimate_normals, orient_to_camera
-from kmn_jax.geometry.ball_normals import normals_within_radius
+from kmn_jax.data import (
+    Crop,
+    CropConfig,
+    DevicePack,
+    NormalSource,
+    Pack,
+    draw_crop,
+    stack_pack,
+    take_scene,
+    visible_points,
+)
+from kmn_jax.geometry import estimate_normals, normals_within_radius, orient_to_camera
 from kmn_jax.report import print_table, write_json
+from kmn_jax.simulate import SplatConfig, VisiblePoints
 
 NUM_KEYPOINTS = 20
 

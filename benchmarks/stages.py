@@ -20,11 +20,10 @@ from configs import find_config
 from experiments.evaluation.cases import Case as PoseCase
 from experiments.evaluation.cases import draw_cases, padded
 from experiments.evaluation.sources import bop_objects
-from kmn_jax.checks import InputError
-from kmn_jax.data.cad import ObjectModel
-from kmn_jax.estimator.crop_pose import (
+from kmn_jax.detection import (
     CropPoseConfig,
     Said,
+    SceneArrays,
     crop_for_draws,
     crop_pose,
     draw_of_crop,
@@ -34,12 +33,10 @@ from kmn_jax.estimator.crop_pose import (
     search_draws,
     surface_scores,
 )
-from kmn_jax.estimator.part import PartArrays, arrays_of, make_part
-from kmn_jax.estimator.scan_crop import SceneArrays
-from kmn_jax.geometry.knn import neighbor_graph
-from kmn_jax.geometry.order import space_filling_order
-from kmn_jax.models import Model, load_pretrained
-from kmn_jax.models.normalization import released_scene
+from kmn_jax.errors import InputError
+from kmn_jax.geometry import neighbor_graph, space_filling_order
+from kmn_jax.models import Model, load_pretrained, released_scene
+from kmn_jax.objects import ObjectModel, PartArrays, arrays_of, make_part
 from kmn_jax.pose import IcpConfig
 
 _SMALL_SET = Path("experiments/assets/small_test_set")

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from kmn_jax.geometry.se3 import from_rotation_translation, random_rotation, rotate_vectors, transform_points
-from kmn_jax.pose.matches import Matches
+from kmn_jax.geometry import from_rotation_translation, random_rotation, rotate_vectors, transform_points
+from kmn_jax.pose import Matches
 from kmn_jax.typing import Normals, Points, Pose, PRNGKey
 
 SIDES = (0.8, 0.5, 0.33)  # of the box, in diameters: their root sum of squares is 1

@@ -21,10 +21,11 @@ import tyro
 from benchmarks.network_cases import make_case
 from benchmarks.timing import time_in_turn
 from configs import find_config
-from kmn_jax.models.layers import Compute
+from kmn_jax.models import Compute
 from kmn_jax.report import print_table, write_json
-from kmn_jax.train.config import TrainConfig
-from kmn_jax.train.sharding import (
+from kmn_jax.train import (
+    TrainConfig,
+    create_state,
     data_mesh,
     jit_make_samples,
     jit_train_step,
@@ -32,9 +33,8 @@ from kmn_jax.train.sharding import (
     put_number,
     put_whole,
     split_cpu,
+    training_source,
 )
-from kmn_jax.train.sources import training_source
-from kmn_jax.train.step import create_state
 
 _PACK = "experiments/assets/small_pack"
 _COMPARED = 4  # crops in the batch that is compared with PyTorch

@@ -11,8 +11,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from benchmarks.timing import Ceilings
-from kmn_jax.models import KeyMatchNetConfig
-from kmn_jax.models.invariants import NUM_OBJECT_INVARIANTS, NUM_PAIR_INVARIANTS, NUM_SCENE_INVARIANTS
+from kmn_jax.models import NUM_OBJECT_INVARIANTS, NUM_PAIR_INVARIANTS, NUM_SCENE_INVARIANTS, KeyMatchNetConfig
 from kmn_jax.pose import IcpConfig, MatchConfig, RansacConfig
 
 _FLOAT = 4

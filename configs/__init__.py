@@ -10,8 +10,8 @@ from configs.normalization import normalization_metric, normalization_released
 from configs.paper import paper, paper_tenth
 from configs.per_object import per_object
 from configs.small import small
-from kmn_jax.checks import InputError
-from kmn_jax.train.config import TrainConfig
+from kmn_jax.errors import InputError
+from kmn_jax.train._config import TrainConfig
 
 CONFIGS: dict[str, TrainConfig] = {
     config.name: config

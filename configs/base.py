@@ -11,10 +11,9 @@ base
 
 from __future__ import annotations
 
-from kmn_jax.data.pipeline import PipelineConfig
+from kmn_jax.data import PipelineConfig
 from kmn_jax.models import KeyMatchNetConfig
-from kmn_jax.train.config import TrainConfig
-from kmn_jax.train.optimizer import OptimizerConfig
+from kmn_jax.train import OptimizerConfig, TrainConfig
 
 base = TrainConfig(
     name="base",

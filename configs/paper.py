@@ -19,10 +19,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from kmn_jax.data.pipeline import PipelineConfig
+from kmn_jax.data import PipelineConfig
 from kmn_jax.models import KeyMatchNetConfig
-from kmn_jax.train.config import TrainConfig
-from kmn_jax.train.optimizer import OptimizerConfig
+from kmn_jax.train import OptimizerConfig, TrainConfig
 
 _EPOCH = 1_450 * 160
 _BATCH = 14

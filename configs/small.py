@@ -11,12 +11,9 @@ small
 
 from __future__ import annotations
 
-from kmn_jax.data.crops import CropConfig
-from kmn_jax.data.pipeline import PipelineConfig
+from kmn_jax.data import CropConfig, PipelineConfig
 from kmn_jax.models import KeyMatchNetConfig
-from kmn_jax.train.config import TrainConfig
-from kmn_jax.train.examples import ExampleConfig
-from kmn_jax.train.optimizer import OptimizerConfig
+from kmn_jax.train import ExampleConfig, OptimizerConfig, TrainConfig
 
 small = TrainConfig(
     name="small",

@@ -14,7 +14,7 @@ from typing import Any
 from experiments.evaluate import Options, compare, released_or_own, run
 from experiments.evaluation.cases import Method
 from experiments.evaluation.methods import Ours, OursConfig
-from kmn_jax.estimator.crop_pose import CropPoseConfig
+from kmn_jax.detection import CropPoseConfig
 from kmn_jax.models import Model
 
 _PLAIN = CropPoseConfig()

@@ -11,18 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from kmn_jax.checks import InputError
-from kmn_jax.data.background import bin_content
-from kmn_jax.data.bop import BopDataset, BopFrame, FrameKey
-from kmn_jax.data.bop_crops import load_models
-from kmn_jax.data.cad import ObjectConfig
-from kmn_jax.data.scan_files import Scan
-from kmn_jax.data.scene import Bin, measured_points
-from kmn_jax.estimator.part import Part, make_part
-from kmn_jax.estimator.scene import Scene, make_scene
-from kmn_jax.estimator.view import View, view_of
+from kmn_jax.bop import BopDataset, BopFrame, FrameKey
+from kmn_jax.data import load_models
+from kmn_jax.detection import Scene, View, bin_content, make_scene, view_of
+from kmn_jax.errors import InputError
+from kmn_jax.geometry import measured_points
+from kmn_jax.io import Scan
 from kmn_jax.models import Model
+from kmn_jax.objects import ObjectConfig, Part, make_part
 from kmn_jax.pose import adi
+from kmn_jax.simulate import Bin
 
 _UNIT = "mm"
 _MOST_POINTS = 131_072

@@ -39,12 +39,9 @@ from experiments.test_sets import (
     validation_sources,
     verdict,
 )
-from kmn_jax.checks import InputError
-from kmn_jax.data.build import Record, Source, build_pack
-from kmn_jax.data.pack import Pack, PackedObject
-from kmn_jax.data.recipe import PackConfig
-from kmn_jax.data.scene import BinScene
-from kmn_jax.data.sensor import PERFECT, SensorConfig
+from kmn_jax.data import Pack, PackConfig, PackedObject, Record, Source, build_pack
+from kmn_jax.errors import InputError
+from kmn_jax.simulate import PERFECT, BinScene, SensorConfig
 
 OUTPUTS = Path("outputs")
 SMALL_PACK = (

@@ -21,30 +21,30 @@ from experiments.bins import THRESHOLD, bin_images
 from experiments.fpfh import SOLVERS
 from experiments.reliability_picture import save_reliability
 from experiments.test_sets import SPLIT
-from kmn_jax.checks import InputError
-from kmn_jax.estimator.calibrate import (
+from kmn_jax.detection import (
+    EVIDENCE,
+    SIGNS,
     Calibration,
-    Probabilities,
-    expected_calibration_error,
-    fit_calibration,
-    probabilities_bytes,
-    reliability,
-)
-from kmn_jax.estimator.candidates import (
     CandidateConfig,
     Candidates,
+    Probabilities,
+    Scene,
     Seeds,
+    SelectConfig,
     Solver,
+    expected_calibration_error,
     find_candidates,
+    fit_calibration,
     improved,
+    probabilities_bytes,
+    reliability,
     seeds_over,
+    select,
 )
-from kmn_jax.estimator.evidence import EVIDENCE, SIGNS
-from kmn_jax.estimator.part import Part
-from kmn_jax.estimator.scene import Scene
-from kmn_jax.estimator.select import SelectConfig, select
+from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
 from kmn_jax.models import Model, load_model, load_pretrained
+from kmn_jax.objects import Part
 from kmn_jax.report import check_target, print_table, write_json
 
 SHIPPED = Path(__file__).parent.parent / "kmn_jax" / "pretrained" / "small.calibration.json"

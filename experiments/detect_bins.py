@@ -24,12 +24,19 @@ from experiments.calibrate import SHIPPED
 from experiments.fpfh import fpfh_poses
 from experiments.reliability_picture import save_reliability
 from experiments.test_sets import SPLIT
-from kmn_jax.checks import InputError
-from kmn_jax.estimator.calibrate import Probabilities, expected_calibration_error, load_probabilities, reliability
-from kmn_jax.estimator.candidates import Solver
-from kmn_jax.estimator.detect import THOROUGH, DetectConfig, detect
-from kmn_jax.estimator.evidence import EVIDENCE
-from kmn_jax.estimator.result import Detections
+from kmn_jax.detection import (
+    EVIDENCE,
+    THOROUGH,
+    DetectConfig,
+    Detections,
+    Probabilities,
+    Solver,
+    detect,
+    expected_calibration_error,
+    load_probabilities,
+    reliability,
+)
+from kmn_jax.errors import InputError
 from kmn_jax.models import load_model, load_pretrained
 from kmn_jax.report import check_target, print_table, write_json
 

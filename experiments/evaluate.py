@@ -31,14 +31,13 @@ from experiments.evaluation.scores import cells_of
 from experiments.evaluation.sources import Report, bop_objects, cloud_objects
 from experiments.evaluation.tuned import RIVALS
 from experiments.test_sets import SPLIT, build_test_set
-from kmn_jax.checks import InputError
-from kmn_jax.data.bop import dataset_digest
-from kmn_jax.data.bop_models import NAMES_FILE
-from kmn_jax.data.build import Source
-from kmn_jax.data.mesh_files import MESH_SUFFIXES, read_file
-from kmn_jax.estimator.part import model_digest
+from kmn_jax.bop import NAMES_FILE, dataset_digest
+from kmn_jax.data import Source
+from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
+from kmn_jax.io import MESH_SUFFIXES, read_file
 from kmn_jax.models import Model, load_model, released_file
+from kmn_jax.objects import model_digest
 from kmn_jax.pose import RansacConfig
 from kmn_jax.report import environment, processor
 

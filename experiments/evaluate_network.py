@@ -19,18 +19,25 @@ import jax
 import numpy as np
 import tyro
 
-from kmn_jax.checks import InputError
-from kmn_jax.data.bop_models import NAMES_FILE
-from kmn_jax.data.crops import CropConfig
-from kmn_jax.data.device_pack import DevicePack, stack_pack
-from kmn_jax.data.pack import Pack
-from kmn_jax.data.pipeline import PipelineConfig, SampleBatches
+from kmn_jax.bop import NAMES_FILE
+from kmn_jax.data import CropConfig, DevicePack, Pack, PipelineConfig, SampleBatches, stack_pack
+from kmn_jax.errors import InputError
 from kmn_jax.models import LossConfig, Model, load_model
 from kmn_jax.report import check_target, print_table, write_json
-from kmn_jax.train.examples import ExampleConfig
-from kmn_jax.train.rendered import rendered_frames
-from kmn_jax.train.sharding import data_mesh, jit_eval_step, put_batch, put_whole
-from kmn_jax.train.step import Samples, StepConfig, Sums, index_of, mean_metrics, total_sums
+from kmn_jax.train import (
+    ExampleConfig,
+    Samples,
+    StepConfig,
+    Sums,
+    data_mesh,
+    index_of,
+    jit_eval_step,
+    mean_metrics,
+    put_batch,
+    put_whole,
+    rendered_frames,
+    total_sums,
+)
 
 SHIPPED = Path(__file__).parent.parent / "kmn_jax" / "pretrained" / "small.safetensors"
 _TEST_SETS = (Path("outputs/test_sets/electronics"), Path("outputs/test_sets/industrial"))

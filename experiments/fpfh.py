@@ -11,17 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.evaluation.rivals import Fpfh, described, quiet_open3d
-from kmn_jax.estimator.candidates import Solver
-from kmn_jax.estimator.part import Part
-from kmn_jax.estimator.scene import Scene
-from kmn_jax.estimator.search import CropFeatures, Hypotheses, Predictions
+from kmn_jax.detection import CropFeatures, Hypotheses, Predictions, Scene, Solver
+from kmn_jax.objects import Part
 from kmn_jax.typing import PRNGKey
 
 _FPFH = Fpfh()
 
 
 def fpfh_poses(part: Part, scene: Scene, crops: CropFeatures, key: PRNGKey) -> tuple[Hypotheses, Predictions]:
-    """Return a pose for each crop; see `kmn_jax.estimator.candidates.Solver`."""
+    """Return a pose for each crop; see `kmn_jax.detection._candidates.Solver`."""
     open3d = quiet_open3d()
     registration = open3d.pipelines.registration
     open3d.utility.random.seed(int(jax.random.randint(key, (), 0, 2**31 - 1)))

@@ -9,9 +9,8 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from kmn_jax.checks import InputError
-from kmn_jax.data.build import Source
-from kmn_jax.data.pack import SPLITS
+from kmn_jax.data import SPLITS, Source
+from kmn_jax.errors import InputError
 
 CATALOGUE = Path(__file__).parent / "assets" / "electronics.json"
 PACKAGE = "kicad-packages3d"

@@ -17,11 +17,11 @@ from typing import Any
 import jax
 import tyro
 
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
 from kmn_jax.models import load_model
 from kmn_jax.report import check_target, markdown_table
-from kmn_jax.train.records import read_metrics
+from kmn_jax.train import read_metrics
 
 FOLDER = Path(__file__).parent.parent / "kmn_jax" / "pretrained"
 LIMIT = 10_000_000  # bytes of a released file

@@ -19,13 +19,11 @@ import numpy as np
 import tyro
 from jaxtyping import Array, Float, Int
 
-from kmn_jax.checks import InputError
-from kmn_jax.data.bop import BopDataset, BopFrame
-from kmn_jax.data.crops import Crop, CropConfig, draw_crop
-from kmn_jax.data.device_pack import DevicePack, stack_pack, take_scene, visible_points
-from kmn_jax.data.pack import Pack
-from kmn_jax.data.splat import BIN, VisiblePoints
+from kmn_jax.bop import BopDataset, BopFrame
+from kmn_jax.data import Crop, CropConfig, DevicePack, Pack, draw_crop, stack_pack, take_scene, visible_points
+from kmn_jax.errors import InputError
 from kmn_jax.geometry import depth_normals
+from kmn_jax.simulate import BIN, VisiblePoints
 
 ASSETS = Path(__file__).parent / "assets"
 

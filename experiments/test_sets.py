@@ -17,16 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from experiments.kicad import catalogue_sources
-from kmn_jax.checks import InputError
-from kmn_jax.data.bop import BopDataset, dataset_digest, finest_depth_scale, write_camera, write_models, write_scene
-from kmn_jax.data.build import Source, one_thread_a_process
-from kmn_jax.data.cad import ObjectModel, load_object
-from kmn_jax.data.hulls import collision_shape
-from kmn_jax.data.raycast import RayMesh
-from kmn_jax.data.recipe import PackConfig, bin_scenes, rendered_frame
-from kmn_jax.data.sensor import PERFECT, SensorConfig
+from kmn_jax.bop import BopDataset, dataset_digest, finest_depth_scale, write_camera, write_models, write_scene
+from kmn_jax.data import PackConfig, Source, bin_scenes, one_thread_a_process, rendered_frame
+from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
+from kmn_jax.objects import ObjectModel, load_object
 from kmn_jax.report import processor
+from kmn_jax.simulate import PERFECT, RayMesh, SensorConfig, collision_shape
 
 ASSETS = Path(__file__).parent / "assets"
 DIGESTS = ASSETS / "test_sets.json"

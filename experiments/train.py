@@ -16,10 +16,8 @@ from typing import Annotated
 import tyro
 
 from configs import CONFIGS, find_config
-from kmn_jax.checks import InputError
-from kmn_jax.train.config import TrainConfig
-from kmn_jax.train.loop import NotFiniteError, train
-from kmn_jax.train.sharding import initialize_distributed, split_cpu
+from kmn_jax.errors import InputError
+from kmn_jax.train import NotFiniteError, TrainConfig, initialize_distributed, split_cpu, train
 
 
 @dataclass(frozen=True)

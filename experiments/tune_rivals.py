@@ -15,7 +15,7 @@ from experiments.evaluation.cases import Method
 from experiments.evaluation.methods import ONE_RANSAC, Ours, OursConfig
 from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kiss, OverMatches, PointPairs, missing
 from experiments.evaluation.tuned import RIVALS
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 from kmn_jax.models import Model
 
 # Voxels without smoothing and with it; finer where the coarse end of a first look was the worse one.

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-    from kmn_jax.data.scan_files import Scan
-    from kmn_jax.estimator import Detections, Part
+    from kmn_jax.detection import Detections
+    from kmn_jax.io import Scan
+    from kmn_jax.objects import Part
 
 Units = Literal["auto", "mm", "cm", "m", "in"]
 
@@ -72,7 +73,8 @@ def prepare(
         units: unit of the source's lengths; auto: what the format says, else millimetres.
         weights: released network, or a .safetensors file.
     """
-    from kmn_jax.estimator import PoseEstimator, save_part
+    from kmn_jax.detection import PoseEstimator
+    from kmn_jax.objects import save_part
 
     part = PoseEstimator.from_pretrained(weights).prepare(source, _unit(units))
     target = output or source.with_suffix(".kmn")
@@ -96,7 +98,7 @@ def estimate(
         bop_csv: file for the result as BOP's csv.
         save_picture: file for a picture of scene, segmentation, keypoints and poses (PNG).
     """
-    from kmn_jax.estimator import as_json, table, write_bop_csv, write_json
+    from kmn_jax.detection import as_json, table, write_bop_csv, write_json
 
     if top is not None and top < 1:
         raise InputError(f"top is {top}, but must be at least 1")
@@ -104,7 +106,7 @@ def estimate(
         if target is not None and not target.parent.is_dir():
             raise InputError(f"cannot write {target}: its folder does not exist")
     if save_picture is not None:
-        from kmn_jax.estimator.picture import check_picture
+        from kmn_jax.viz import check_picture
 
         check_picture(save_picture)
     session = _Session(request)
@@ -120,7 +122,7 @@ def estimate(
         write_bop_csv(found, bop_csv, *session.bop_ids)
         print(f"wrote {bop_csv}")
     if save_picture is not None:
-        from kmn_jax.estimator.picture import save_picture as draw
+        from kmn_jax.viz import save_picture as draw
 
         draw(save_picture, session.scene.view, session.part, found, session.truth)
         print(f"wrote {save_picture}")
@@ -138,8 +140,8 @@ def view(
         host: address to serve on; 0.0.0.0 for other machines, too.
         port: port to serve on.
     """
-    from kmn_jax.estimator import table
-    from kmn_jax.estimator.viewer import Viewer
+    from kmn_jax.detection import table
+    from kmn_jax.viz import Viewer
 
     session = _Session(request)
     found = session.detect(session.places)
@@ -167,8 +169,7 @@ def export(
         points: how many points its scans hold at most.
         weights: released network, or a .safetensors file.
     """
-    from kmn_jax.estimator import PoseEstimator
-    from kmn_jax.estimator.export import export_estimator
+    from kmn_jax.detection import PoseEstimator, export_estimator
 
     estimator = PoseEstimator.from_pretrained(weights)
     part = estimator.prepare(object, _unit(units))
@@ -188,8 +189,7 @@ def convert(
         target: .safetensors for a kmn_jax model; .t7, .pt or .pth for the authors' form.
         released_names: write the authors' names into a .safetensors target too.
     """
-    from kmn_jax.models import load_model, load_released, save_model, save_released
-    from kmn_jax.models.weights import is_model_file
+    from kmn_jax.models import is_model_file, load_model, load_released, save_model, save_released
 
     model = load_model(source) if is_model_file(source) else load_released(source)
     if target.suffix == ".safetensors" and not released_names:
@@ -203,10 +203,7 @@ class _Session:
     """An estimator with the part and the scan of a request."""
 
     def __init__(self, request: Request) -> None:
-        from kmn_jax.data.foreground import ForegroundOptions
-        from kmn_jax.estimator import PoseEstimator
-        from kmn_jax.estimator.detect import THOROUGH
-        from kmn_jax.estimator.timing import Clock
+        from kmn_jax.detection import THOROUGH, Clock, ForegroundOptions, PoseEstimator
 
         places = [_numbers(text, "--at", 3) for text in request.at]
         region: Any = None if request.roi is None else tuple(_numbers(request.roi, "--roi", 6))
@@ -226,15 +223,14 @@ class _Session:
 
     def detect(self, places: Float[np.ndarray, "k 3"] | None) -> Detections:
         """Search the scan, or places of it only."""
-        from kmn_jax.estimator.timing import Clock
+        from kmn_jax.detection import Clock
 
         clock, self._clock = self._clock, Clock()
         return self.estimator.detect(self.part, self.scene, seed=self._request.seed, at=places, clock=clock)
 
     def _read(self, path: Path) -> Scan:
-        from kmn_jax.data.bop_scans import bop_scan, bop_scene_id, bop_sizes, is_bop_image
-        from kmn_jax.data.scan_files import read_scan
-        from kmn_jax.data.units import resolve_unit
+        from kmn_jax.bop import bop_scan, bop_scene_id, bop_sizes, is_bop_image
+        from kmn_jax.io import read_scan, resolve_unit
 
         request = self._request
         if request.camera is not None or not is_bop_image(path):

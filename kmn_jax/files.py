@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 
 
 def write_whole(path: str | Path, content: bytes) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 import jax
 
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 
 
 def environment() -> dict[str, Any]:

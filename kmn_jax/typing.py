@@ -15,5 +15,5 @@ Quaternion = Float[Array, "4"]
 Scalar = Float[Array, ""]
 PRNGKey = Key[Array, ""] | UInt32[Array, "2"]
 
-# What a public function accepts as an array: JAX, NumPy, nested lists. kmn_jax.checks judges it, with its own errors.
+# What a public function accepts as an array: JAX, NumPy, nested lists. kmn_jax.errors judges it, with its own errors.
 ArrayInput: TypeAlias = Any

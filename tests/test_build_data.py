@@ -13,15 +13,11 @@ import pytest
 from experiments import kicad, test_sets
 from experiments.build_data import SMALL_PACK, reach_beyond_bin
 from experiments.kicad import catalogue_sources
-from kmn_jax.checks import InputError
-from kmn_jax.data.bop import BopDataset
-from kmn_jax.data.mesh_files import read_mesh
-from kmn_jax.data.pack import Pack
-from kmn_jax.data.raycast import RayMesh, render
-from kmn_jax.data.recipe import PackConfig
-from kmn_jax.data.scene import BinScene
-from kmn_jax.data.sensor import SensorConfig
-from kmn_jax.data.views import CameraConfig
+from kmn_jax.bop import BopDataset
+from kmn_jax.data import Pack, PackConfig
+from kmn_jax.errors import InputError
+from kmn_jax.io import read_mesh
+from kmn_jax.simulate import BinScene, CameraConfig, RayMesh, SensorConfig, render
 
 ROOT = Path(__file__).parents[1]
 ASSETS = test_sets.ASSETS

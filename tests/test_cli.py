@@ -9,7 +9,7 @@ import pytest
 from safetensors.numpy import load_file
 
 from kmn_jax.cli import main
-from kmn_jax.models.torch_file import read_state_dict, state_dict_bytes
+from kmn_jax.models._torch_file import read_state_dict, state_dict_bytes
 from tests.golden.make_network import draw_state_dict
 
 

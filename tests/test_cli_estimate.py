@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kmn_jax.bop import bop_scan
+from kmn_jax.bop._results import read_results
 from kmn_jax.cli import main
-from kmn_jax.data.bop_results import read_results
-from kmn_jax.data.bop_scans import bop_scan
 
 ASSETS = Path(__file__).parent.parent / "experiments" / "assets"
 IMAGE = sorted((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))[0]

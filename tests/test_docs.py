@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kmn_jax.models.torch_file import state_dict_bytes
+from kmn_jax.models._torch_file import state_dict_bytes
 from tests.golden.make_network import draw_state_dict
 from tests.reference.clouds import box_cloud, scene_crop
 

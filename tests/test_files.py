@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
 
 

@@ -14,9 +14,9 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from kmn_jax.checks import InputError
-from kmn_jax.data.cad import ObjectModel
-from kmn_jax.estimator.scan_crop import SceneArrays, padded_points
+from kmn_jax.detection import SceneArrays, padded_points
+from kmn_jax.errors import InputError
+from kmn_jax.objects import ObjectModel
 
 UNIT = "mm"
 _SEED_DRAWS = 5000  # points of a scan whose copy is looked for

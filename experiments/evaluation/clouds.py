@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from kmn_jax.checks import InputError, rigid_pose
+from kmn_jax.errors import InputError, rigid_pose
 
 _SCANS = {".ply", ".pcd", ".xyz", ".npy", ".npz", ".png", ".tif", ".tiff", ".exr"}
 _POSES = {".txt", ".json"}

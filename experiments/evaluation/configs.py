@@ -33,7 +33,7 @@ from typing import Literal
 
 import numpy as np
 
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 
 Source = Literal["bop", "clouds"]
 METHODS = ("ours", "ours_ransac", "ours_no_normals", "ours_open3d", "fpfh", "fgr", "ppf", "kiss")

@@ -10,14 +10,15 @@ from pathlib import Path
 _ROOT = Path(__file__).parents[2]
 # Of all methods: cases and refinement.
 _SHARED = (
-    *("kmn_jax/data", "kmn_jax/geometry", "kmn_jax/estimator/scan_crop.py", "kmn_jax/estimator/view.py"),
-    *(f"kmn_jax/pose/{name}.py" for name in ("icp", "kabsch", "result")),
+    *(f"kmn_jax/{room}" for room in ("geometry", "io", "objects", "simulate", "bop", "data")),
+    *(f"kmn_jax/detection/_{name}.py" for name in ("scan_crop", "view", "background", "foreground", "planes", "walls")),
+    *(f"kmn_jax/pose/_{name}.py" for name in ("icp", "kabsch", "result")),
     *(f"experiments/evaluation/{name}.py" for name in ("cases", "clouds", "predictions", "refinement", "sources")),
 )
 _OURS = (
     "kmn_jax/models",
-    *(f"kmn_jax/pose/{name}.py" for name in ("matches", "ransac", "surface")),
-    *(f"kmn_jax/estimator/{name}.py" for name in ("crop_pose", "part")),
+    *(f"kmn_jax/pose/_{name}.py" for name in ("matches", "ransac", "surface")),
+    "kmn_jax/detection/_crop_pose.py",
     "experiments/evaluation/methods.py",
 )
 _RIVALS = ("experiments/evaluation/rivals.py",)

@@ -13,23 +13,21 @@ from flax import nnx
 from jaxtyping import Float
 
 from experiments.evaluation.cases import Case, Solver, padded
-from kmn_jax.checks import InputError
-from kmn_jax.data.cad import ObjectModel
-from kmn_jax.data.crops import Crop
-from kmn_jax.estimator.crop_pose import (
+from kmn_jax.data import Crop
+from kmn_jax.detection import (
     CropPoseConfig,
+    CropPrediction,
     Said,
+    SceneArrays,
     crop_for_draws,
     crop_pose,
     draw_of_crop,
     matches_of,
     said_of_draw,
 )
-from kmn_jax.estimator.part import Part, PartArrays, arrays_of, make_part, model_digest
-from kmn_jax.estimator.result import CropPrediction
-from kmn_jax.estimator.scan_crop import SceneArrays
-from kmn_jax.models import Model
-from kmn_jax.models.keymatchnet import model_structure
+from kmn_jax.errors import InputError
+from kmn_jax.models import Model, model_structure
+from kmn_jax.objects import ObjectModel, Part, PartArrays, arrays_of, make_part, model_digest
 from kmn_jax.pose import Matches, RansacConfig
 from kmn_jax.typing import PRNGKey
 

@@ -13,12 +13,9 @@ from experiments.evaluation.cases import Case
 from experiments.evaluation.methods import Ours
 from experiments.evaluation.plots import as_png, new_figure
 from experiments.evaluation.scores import THRESHOLD
-from kmn_jax.data.cad import ObjectModel
-from kmn_jax.estimator.part import Part
-from kmn_jax.estimator.picture_legend import draw_part
-from kmn_jax.estimator.raster import distinct_colors
-from kmn_jax.estimator.result import Detection
-from kmn_jax.estimator.truth import TRUTH_COLORS, truth_codes
+from kmn_jax.detection import Detection
+from kmn_jax.objects import ObjectModel, Part
+from kmn_jax.viz import TRUTH_COLORS, distinct_colors, draw_part, truth_codes
 
 _DOT = 3.0
 _RIGHT, _WRONG, _RIVAL = "tab:green", "tab:red", "tab:blue"

@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.evaluation.configs import noise_name
 from experiments.evaluation.scores import Cell, pooled
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 
 
 def recall_plot(cells: Sequence[Cell], noises: Sequence[float]) -> bytes:

@@ -21,7 +21,7 @@ from safetensors.numpy import save
 
 from experiments.evaluation.cases import Case, Method, ObjectImages, draw_cases
 from experiments.evaluation.refinement import Refinement
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 from kmn_jax.files import read_safetensors, write_whole
 from kmn_jax.report import commit
 

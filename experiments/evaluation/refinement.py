@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.evaluation.cases import Case, padded
-from kmn_jax.data.cad import ObjectModel
-from kmn_jax.data.crops import CropConfig
-from kmn_jax.data.smoothing import SmoothConfig
-from kmn_jax.estimator.scan_crop import first_crop
+from kmn_jax.data import CropConfig
+from kmn_jax.detection import first_crop
+from kmn_jax.geometry import SmoothConfig
+from kmn_jax.objects import ObjectModel
 from kmn_jax.pose import IcpConfig, icp
 
 CONFIG = IcpConfig(iterations=20)

@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.evaluation.cases import Case, Solver
-from kmn_jax.data.cad import ObjectModel
-from kmn_jax.data.smoothing import smoothed
-from kmn_jax.estimator.scan_crop import padded_points
+from kmn_jax.detection import padded_points
+from kmn_jax.geometry import smoothed
+from kmn_jax.objects import ObjectModel
 from kmn_jax.pose import Matches
 
 _LEAST_POINTS = 10  # of a thinned crop
@@ -35,7 +35,7 @@ class FeatureSettings:
     voxel: float = 0.04
     normal_voxels: float = 2.0  # radius, at most 30 neighbours
     feature_voxels: float = 5.0  # radius, at most 100 neighbours
-    smooth: bool = False  # points and normals of a scan as our network gets them, see `kmn_jax.data.smoothing`
+    smooth: bool = False  # points and normals of a scan as our network gets them, see `kmn_jax.geometry._smoothing`
 
 
 class Described(NamedTuple):

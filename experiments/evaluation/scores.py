@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from experiments.bins import adi_of_pairs
 from experiments.evaluation.configs import noise_name
 from experiments.evaluation.predictions import Export, Predictions, Truth
-from kmn_jax.data.cad import ObjectModel
+from kmn_jax.objects import ObjectModel
 
 THRESHOLD = 0.1  # of the object's size
 _POINTS = 1000  # of an object's surface, for errors

@@ -13,17 +13,14 @@ from jaxtyping import Bool, Float, Float32
 
 from experiments.evaluation.cases import UNIT, Image, ObjectImages
 from experiments.evaluation.clouds import camera_of, mesh_of, scans_with_poses
-from kmn_jax.checks import InputError
-from kmn_jax.data.background import bin_content
-from kmn_jax.data.bop import BopDataset, BopFrame, FrameKey
-from kmn_jax.data.bop_crops import load_models
-from kmn_jax.data.bop_models import NAMES_FILE
-from kmn_jax.data.cad import ObjectConfig, ObjectModel, load_object
-from kmn_jax.data.foreground import foreground
-from kmn_jax.data.mesh_files import METRES, read_file
-from kmn_jax.data.scan_files import Scan, read_scan
-from kmn_jax.data.scene import measured_points
-from kmn_jax.estimator.view import view_of
+from kmn_jax.bop import NAMES_FILE, BopDataset, BopFrame, FrameKey
+from kmn_jax.data import load_models
+from kmn_jax.detection import bin_content, foreground, view_of
+from kmn_jax.errors import InputError
+from kmn_jax.geometry import measured_points
+from kmn_jax.io import Scan, read_file, read_scan
+from kmn_jax.objects import ObjectConfig, ObjectModel, load_object
+from kmn_jax.units import METRES
 
 OBJECT = ObjectConfig(num_points=4096)
 Report = Callable[[str], None]

@@ -1,4 +1,40 @@
-"""From CAD files to labelled scenes: object models, bins under physics, renderings, packs, BOP datasets.
+"""Training samples: packs of objects in bins, and labelled crops made of them or of rendered images."""
 
-Import the submodules: open3d, trimesh, mujoco and grain are loaded by the functions that need them, not before.
-"""
+from kmn_jax.data._bop_crops import BopCropConfig, BopCrops, load_models
+from kmn_jax.data._build import Record, Source, build_pack, one_thread_a_process
+from kmn_jax.data._crops import Crop, CropConfig, NormalSource, camera_normals, crop_around, draw_crop
+from kmn_jax.data._device_pack import DevicePack, StackedPack, stack_pack, take_scene, visible_points
+from kmn_jax.data._pack import SPLITS, Pack, PackedObject
+from kmn_jax.data._pipeline import BatchIterator, PipelineConfig, SampleBatches, SampleIndex
+from kmn_jax.data._recipe import PackConfig, bin_scenes, rendered_frame
+
+__all__ = [
+    "SPLITS",
+    "BatchIterator",
+    "BopCropConfig",
+    "BopCrops",
+    "Crop",
+    "CropConfig",
+    "DevicePack",
+    "NormalSource",
+    "Pack",
+    "PackConfig",
+    "PackedObject",
+    "PipelineConfig",
+    "Record",
+    "SampleBatches",
+    "SampleIndex",
+    "Source",
+    "StackedPack",
+    "bin_scenes",
+    "build_pack",
+    "camera_normals",
+    "crop_around",
+    "draw_crop",
+    "load_models",
+    "one_thread_a_process",
+    "rendered_frame",
+    "stack_pack",
+    "take_scene",
+    "visible_points",
+]

@@ -1,12 +1,21 @@
-"""Pure functions on points and poses, one example at a time; batching is the caller's `vmap`."""
+"""Pure functions on points, poses and cameras, one example at a time; batching is the caller's `vmap`."""
 
-from kmn_jax.geometry.crop import Selection, radius_crop, voxel_thin
-from kmn_jax.geometry.eigen import dominant_eigenvector
-from kmn_jax.geometry.knn import k_nearest, largest_distance, nearest, neighbor_graph, squared_distances
-from kmn_jax.geometry.normals import depth_normals, depth_to_points, estimate_normals, orient_to_camera
-from kmn_jax.geometry.order import space_filling_order
-from kmn_jax.geometry.sampling import farthest_point_indices
-from kmn_jax.geometry.se3 import (
+from kmn_jax.geometry._ball_normals import normals_within_radius
+from kmn_jax.geometry._camera import Camera, Intrinsics, intrinsics, measured_points
+from kmn_jax.geometry._eigen import dominant_eigenvector
+from kmn_jax.geometry._knn import (
+    first_smallest,
+    k_nearest,
+    largest_distance,
+    nearest,
+    neighbor_graph,
+    squared_distances,
+)
+from kmn_jax.geometry._normals import depth_normals, depth_to_points, estimate_normals, orient_to_camera
+from kmn_jax.geometry._norms import safe_norm, safe_sqrt
+from kmn_jax.geometry._order import space_filling_order
+from kmn_jax.geometry._sampling import farthest_point_indices
+from kmn_jax.geometry._se3 import (
     compose,
     from_quaternion_translation,
     from_rotation_translation,
@@ -21,23 +30,32 @@ from kmn_jax.geometry.se3 import (
     transform_points,
     translation_between,
 )
+from kmn_jax.geometry._smoothing import SmoothConfig, smoothed
+from kmn_jax.geometry._subsets import Selection, radius_crop, voxel_thin
 
 __all__ = [
+    "Camera",
+    "Intrinsics",
     "Selection",
+    "SmoothConfig",
     "compose",
     "depth_normals",
     "depth_to_points",
     "dominant_eigenvector",
     "estimate_normals",
     "farthest_point_indices",
+    "first_smallest",
     "from_quaternion_translation",
     "from_rotation_translation",
+    "intrinsics",
     "inverse",
     "k_nearest",
     "largest_distance",
     "matrix_to_quaternion",
+    "measured_points",
     "nearest",
     "neighbor_graph",
+    "normals_within_radius",
     "orient_to_camera",
     "pose_error",
     "quaternion_to_matrix",
@@ -46,6 +64,9 @@ __all__ = [
     "random_rotation",
     "rotate_vectors",
     "rotation_angle_between",
+    "safe_norm",
+    "safe_sqrt",
+    "smoothed",
     "space_filling_order",
     "squared_distances",
     "transform_points",

@@ -1,6 +1,7 @@
 """The network: published shapes from exact algebra, object and scene features as reusable values."""
 
-from kmn_jax.models.keymatchnet import (
+from kmn_jax.models._invariants import NUM_OBJECT_INVARIANTS, NUM_PAIR_INVARIANTS, NUM_SCENE_INVARIANTS
+from kmn_jax.models._keymatchnet import (
     KeyMatchNet,
     KeyMatchNetConfig,
     Model,
@@ -11,12 +12,18 @@ from kmn_jax.models.keymatchnet import (
     match,
     model_structure,
 )
-from kmn_jax.models.losses import LossConfig, MatchingLoss, keypoint_labels, matching_loss
-from kmn_jax.models.released import RELEASED_CONFIG, load_released, save_released
-from kmn_jax.models.weights import load_model, load_pretrained, released_file, save_model
+from kmn_jax.models._layers import Compute
+from kmn_jax.models._losses import LossConfig, MatchingLoss, keypoint_labels, matching_loss
+from kmn_jax.models._normalization import released_object, released_scene
+from kmn_jax.models._released import RELEASED_CONFIG, load_released, save_released
+from kmn_jax.models._weights import is_model_file, load_model, load_pretrained, released_file, save_model
 
 __all__ = [
+    "NUM_OBJECT_INVARIANTS",
+    "NUM_PAIR_INVARIANTS",
+    "NUM_SCENE_INVARIANTS",
     "RELEASED_CONFIG",
+    "Compute",
     "KeyMatchNet",
     "KeyMatchNetConfig",
     "LossConfig",
@@ -26,6 +33,7 @@ __all__ = [
     "create_model",
     "encode_object",
     "encode_scene",
+    "is_model_file",
     "keypoint_labels",
     "load_model",
     "load_pretrained",
@@ -34,6 +42,8 @@ __all__ = [
     "matching_loss",
     "model_structure",
     "released_file",
+    "released_object",
+    "released_scene",
     "save_model",
     "save_released",
 ]

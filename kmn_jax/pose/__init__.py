@@ -4,10 +4,10 @@ Three functions share the name of their module (`kabsch`, `ransac`, `icp`): as a
 names are the functions.
 """
 
-from kmn_jax.pose.icp import IcpConfig, icp
-from kmn_jax.pose.kabsch import kabsch
-from kmn_jax.pose.matches import MatchConfig, Matches, find_matches
-from kmn_jax.pose.metrics import (
+from kmn_jax.pose._icp import IcpConfig, icp
+from kmn_jax.pose._kabsch import kabsch
+from kmn_jax.pose._matches import MatchConfig, Matches, find_matches
+from kmn_jax.pose._metrics import (
     add,
     adi,
     bounding_box_diagonal,
@@ -18,9 +18,9 @@ from kmn_jax.pose.metrics import (
     nearest_instance_error,
     recall,
 )
-from kmn_jax.pose.ransac import RansacConfig, ransac, ransac_modes
-from kmn_jax.pose.result import PoseResult, PoseStatus
-from kmn_jax.pose.surface import SurfaceAgreement, SurfaceConfig, surface_agreement
+from kmn_jax.pose._ransac import RansacConfig, ransac, ransac_modes
+from kmn_jax.pose._result import PoseResult, PoseStatus
+from kmn_jax.pose._surface import SurfaceAgreement, SurfaceConfig, surface_agreement
 
 __all__ = [
     "IcpConfig",

@@ -1,4 +1,48 @@
-"""Training: examples made of packs inside the step, the step itself, sharding, checkpoints and the loop.
+"""Training: samples made inside the step, the step itself, sharding, checkpoints and the loop."""
 
-Import the submodules: grain and orbax are loaded by the functions that need them, not before.
-"""
+from kmn_jax.train._config import TrainConfig
+from kmn_jax.train._examples import ExampleConfig
+from kmn_jax.train._loop import NotFiniteError, train
+from kmn_jax.train._optimizer import OptimizerConfig
+from kmn_jax.train._records import read_metrics
+from kmn_jax.train._rendered import rendered_frames
+from kmn_jax.train._sharding import (
+    data_mesh,
+    initialize_distributed,
+    jit_eval_step,
+    jit_make_samples,
+    jit_train_step,
+    put_batch,
+    put_number,
+    put_whole,
+    split_cpu,
+)
+from kmn_jax.train._sources import training_source
+from kmn_jax.train._step import Samples, StepConfig, Sums, create_state, index_of, mean_metrics, total_sums
+
+__all__ = [
+    "ExampleConfig",
+    "NotFiniteError",
+    "OptimizerConfig",
+    "Samples",
+    "StepConfig",
+    "Sums",
+    "TrainConfig",
+    "create_state",
+    "data_mesh",
+    "index_of",
+    "initialize_distributed",
+    "jit_eval_step",
+    "jit_make_samples",
+    "jit_train_step",
+    "mean_metrics",
+    "put_batch",
+    "put_number",
+    "put_whole",
+    "read_metrics",
+    "rendered_frames",
+    "split_cpu",
+    "total_sums",
+    "train",
+    "training_source",
+]

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import gate
 from benchmarks.network_cases import make_case
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 
 
 def test_a_ratio_that_has_fallen_too_far_is_named() -> None:

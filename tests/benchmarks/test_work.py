@@ -13,7 +13,7 @@ from flax import nnx
 from benchmarks import work
 from benchmarks.network_cases import make_case
 from benchmarks.timing import Ceilings
-from kmn_jax.geometry.knn import squared_distances
+from kmn_jax.geometry import squared_distances
 from kmn_jax.pose import IcpConfig, MatchConfig, RansacConfig
 
 

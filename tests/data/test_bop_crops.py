@@ -10,14 +10,21 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
-from kmn_jax.checks import InputError
-from kmn_jax.data.bop import BopDataset, write_scene
-from kmn_jax.data.bop_crops import BopCropConfig, BopCrops, FrameCrops, load_models
-from kmn_jax.data.cad import ObjectConfig, ObjectModel
-from kmn_jax.data.crops import Crop, CropConfig
-from kmn_jax.data.pipeline import BatchIterator, PipelineConfig, SampleBatches
-from kmn_jax.data.symmetry import Symmetries
-from tests.data.bop_sample import RADIUS, edit_json, sample_frame, write_sample
+from kmn_jax.bop import BopDataset, write_scene
+from kmn_jax.data import (
+    BatchIterator,
+    BopCropConfig,
+    BopCrops,
+    Crop,
+    CropConfig,
+    PipelineConfig,
+    SampleBatches,
+    load_models,
+)
+from kmn_jax.data._bop_crops import FrameCrops
+from kmn_jax.errors import InputError
+from kmn_jax.objects import ObjectConfig, ObjectModel, Symmetries
+from tests.bop.bop_sample import RADIUS, edit_json, sample_frame, write_sample
 
 UNIT = 1000.0  # the datasets are opened in millimetres
 CONFIG = BopCropConfig(

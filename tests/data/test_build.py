@@ -12,10 +12,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from kmn_jax.checks import InputError
-from kmn_jax.data.build import Record, Source, build_pack
-from kmn_jax.data.pack import Pack
-from kmn_jax.data.recipe import PackConfig
+from kmn_jax.data import Pack, PackConfig, Record, Source, build_pack
+from kmn_jax.errors import InputError
 
 CONFIG = PackConfig(surfels=128, bin_surfels=64, drops=2, copies=(1, 2))
 ROOT = Path(__file__).parents[2]
@@ -114,7 +112,7 @@ def test_survives_kill_9_and_ends_with_the_same_files(tmp_path: Path) -> None:
     script = (
         "from pathlib import Path\n"
         "from tests.data.test_build import CONFIG, box_sources\n"
-        "from kmn_jax.data.build import build_pack\n"
+        "from kmn_jax.data._build import build_pack\n"
         "if __name__ == '__main__':\n"
         f"    folder = Path({str(tmp_path)!r})\n"
         "    build_pack(folder / 'killed', box_sources(folder / 'cad', 3), CONFIG, workers=1)\n"

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.data.crops import Crop, CropConfig, draw_crop
-from kmn_jax.data.splat import BIN, VisiblePoints
+from kmn_jax.data import Crop, CropConfig, draw_crop
+from kmn_jax.simulate import BIN, VisiblePoints
 from tests.reference.meshes import pose, random_rotations
 
 COPIES, M, B = 4, 500, 300

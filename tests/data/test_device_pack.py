@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
-from kmn_jax.checks import InputError
-from kmn_jax.data.crops import CropConfig, draw_crop
-from kmn_jax.data.device_pack import DevicePack, stack_pack, take_scene, visible_points
-from kmn_jax.data.pack import Drop, Pack, PackedObject, write_manifest, write_object
-from kmn_jax.data.scene import Bin, BinScene, Camera
-from kmn_jax.data.splat import SplatConfig
+from kmn_jax.data import CropConfig, DevicePack, Pack, PackedObject, draw_crop, stack_pack, take_scene, visible_points
+from kmn_jax.data._pack import Drop, write_manifest, write_object
+from kmn_jax.errors import InputError
+from kmn_jax.geometry import Camera
+from kmn_jax.simulate import Bin, BinScene, SplatConfig
 
 SURFELS, BIN_SURFELS = 256, 64
 RADIUS = 0.02  # metres

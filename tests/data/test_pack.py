@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from kmn_jax.checks import InputError
-from kmn_jax.data.pack import Drop, Pack, PackedObject, quantised, write_manifest, write_object
-from kmn_jax.data.scene import Bin, BinScene, Camera
+from kmn_jax.data import Pack, PackedObject
+from kmn_jax.data._pack import Drop, quantised, write_manifest, write_object
+from kmn_jax.errors import InputError
+from kmn_jax.geometry import Camera
+from kmn_jax.simulate import Bin, BinScene
 
 SIZE = 0.04  # metres
 

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kmn_jax.checks import InputError
-from kmn_jax.data.pipeline import BatchIterator, PipelineConfig, SampleBatches, SampleIndex, index_dataset
+from kmn_jax.data import BatchIterator, PipelineConfig, SampleBatches, SampleIndex
+from kmn_jax.data._pipeline import index_dataset
+from kmn_jax.errors import InputError
 
 CONFIG = PipelineConfig(batch_size=6, samples_per_object=8, crops_per_object=2, seed=3)
 OBJECTS, DROPS = 5, 4
@@ -269,6 +270,6 @@ def test_grain_dataset_maps_batches() -> None:
 
 
 def test_import_does_not_load_grain() -> None:
-    program = "import sys, kmn_jax.data.pipeline; print('grain' in sys.modules)"
+    program = "import sys, kmn_jax.data._pipeline; print('grain' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert result.stdout == "False\n"

@@ -23,11 +23,11 @@ from experiments.evaluation.methods import Ours, OwnNetworks
 from experiments.evaluation.rivals import FastGlobal, Fpfh, Kiss, OverMatches, PointPairs, missing
 from experiments.evaluation.sources import bop_objects, cloud_objects
 from experiments.evaluation.tuned import RIVALS
-from kmn_jax.checks import InputError
-from kmn_jax.data.cad import ObjectModel
+from kmn_jax.errors import InputError
 from kmn_jax.models import create_model, load_model, released_file, save_model
+from kmn_jax.objects import ObjectModel
 from kmn_jax.pose import adi
-from tests.data.bop_sample import save_image
+from tests.bop.bop_sample import save_image
 
 SMALL = Path(evaluate.__file__).parent / "assets" / "small_test_set"
 GEAR, IMAGES = "gear_motor", "2"
@@ -215,13 +215,13 @@ def test_the_code_of_rivals_makes_rivals_stale_alone() -> None:
 def test_the_code_of_a_method_is_whole() -> None:
     """What is imported by code that decides poses decides them as well, but for how inputs are checked and told."""
     told = {f"kmn_jax.{name}" for name in ("checks", "files", "typing", "report")}
-    views = {"kmn_jax.estimator.verify", "kmn_jax.estimator.result"}  # a depth image of a cloud; what is pictured
+    views = {"kmn_jax.detection._verify", "kmn_jax.detection._result"}  # a depth image of a cloud; what is pictured
     shared = set(digests.sources(digests._SHARED))
     for names in (digests._SHARED, digests._OURS, digests._RIVALS):
         files = shared | set(digests.sources(names))
         known = {".".join(file.relative_to(digests._ROOT).with_suffix("").parts) for file in files} | told | views
         if names == digests._RIVALS:
-            known |= {"kmn_jax.pose.matches"}  # what is given
+            known |= {"kmn_jax.pose._matches"}  # what is given
         for file in digests.sources(names):
             assert modules_of(file) <= known, f"{file}: {modules_of(file) - known}"
 

@@ -13,9 +13,9 @@ from PIL import Image
 from experiments import evaluate
 from experiments.evaluation.cases import Image as Scan
 from experiments.evaluation.cases import ObjectImages, draw_cases
-from kmn_jax.checks import InputError
-from kmn_jax.data.bop import dataset_digest
-from tests.data.bop_sample import box_model, save_image
+from kmn_jax.bop import dataset_digest
+from kmn_jax.errors import InputError
+from tests.bop.bop_sample import box_model, save_image
 from tests.reference.poses import some_poses
 
 SMALL = Path(evaluate.__file__).parent / "assets" / "small_test_set"

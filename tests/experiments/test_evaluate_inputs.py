@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from experiments import evaluate
-from kmn_jax.data.bop_models import NAMES_FILE
-from kmn_jax.data.build import Source
+from kmn_jax.bop import NAMES_FILE
+from kmn_jax.data import Source
 from tests.reference.poses import some_poses
 
 SMALL = Path(evaluate.__file__).parent / "assets" / "small_test_set"

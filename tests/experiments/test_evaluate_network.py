@@ -14,7 +14,7 @@ import pytest
 
 from configs import find_config
 from experiments import evaluate_network, release
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 from kmn_jax.models import create_model, load_model, load_pretrained, save_model
 from tests.reference.networks import TINY
 

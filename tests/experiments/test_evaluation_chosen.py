@@ -13,7 +13,7 @@ from experiments.evaluation.configs import EvaluateConfig
 from experiments.evaluation.pictures import Shown
 from experiments.evaluation.predictions import Export, Predictions
 from experiments.evaluation.scores import cells_of
-from tests.data.bop_sample import box_model
+from tests.bop.bop_sample import box_model
 from tests.reference.poses import some_poses
 
 TITLES = {"ours": "kmn_jax", "fpfh": "FPFH", "kiss": "KISS"}

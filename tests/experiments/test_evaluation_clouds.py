@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments.evaluation.clouds import camera_of, mesh_of, read_poses, scans_with_poses
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 from tests.reference.poses import some_poses
 
 

@@ -13,18 +13,10 @@ from experiments.evaluation.configs import noise_name
 from experiments.evaluation.predictions import Export, Predictions
 from experiments.evaluation.published import RECALL
 from experiments.evaluation.report import beaten_by
-from experiments.evaluation.scores import (
-    Cell,
-    cells_of,
-    object_rows,
-    pooled,
-    recall_rows,
-    seed_rows,
-    wilson,
-)
-from kmn_jax.checks import InputError
-from kmn_jax.data.cad import ObjectModel
-from tests.data.bop_sample import box_model
+from experiments.evaluation.scores import Cell, cells_of, object_rows, pooled, recall_rows, seed_rows, wilson
+from kmn_jax.errors import InputError
+from kmn_jax.objects import ObjectModel
+from tests.bop.bop_sample import box_model
 from tests.reference.poses import some_poses
 
 NOISE = 0.01

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.checks import InputError
-from kmn_jax.geometry.ball_normals import normals_within_radius, planes_within_radius
+from kmn_jax.errors import InputError
+from kmn_jax.geometry import normals_within_radius
+from kmn_jax.geometry._ball_normals import planes_within_radius
 
 estimate = jax.jit(normals_within_radius)
 

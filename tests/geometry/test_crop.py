@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 from kmn_jax.geometry import Selection, radius_crop, voxel_thin
 
 SEEDS = range(4)

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.checks import InputError
-from kmn_jax.geometry import depth_normals, depth_to_points, estimate_normals, normals, orient_to_camera
+from kmn_jax.errors import InputError
+from kmn_jax.geometry import _normals as normals
+from kmn_jax.geometry import depth_normals, depth_to_points, estimate_normals, orient_to_camera
 
 SEEDS = range(3)
 estimate = jax.jit(estimate_normals, static_argnames="k")

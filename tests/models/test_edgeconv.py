@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from kmn_jax.models.edgeconv import EdgeConv
-from kmn_jax.models.layers import NormalizedLinear
+from kmn_jax.models._edgeconv import EdgeConv
+from kmn_jax.models._layers import NormalizedLinear
 from tests.models.test_layers import signed_layer
 from tests.reference import dense_jax
 

@@ -9,10 +9,17 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from kmn_jax.checks import InputError
-from kmn_jax.models import KeyMatchNetConfig, create_model, encode_object, encode_scene, match
-from kmn_jax.models.keymatchnet import Model
-from kmn_jax.models.normalization import released_object, released_scene
+from kmn_jax.errors import InputError
+from kmn_jax.models import (
+    KeyMatchNetConfig,
+    Model,
+    create_model,
+    encode_object,
+    encode_scene,
+    match,
+    released_object,
+    released_scene,
+)
 from tests.reference import dense_jax
 from tests.reference.clouds import box_cloud, scene_crop
 

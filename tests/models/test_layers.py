@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from kmn_jax.models.layers import ChannelAffine, NormalizedLinear, channel_moments, dropout, leaky_relu, product
+from kmn_jax.models._layers import ChannelAffine, NormalizedLinear, channel_moments, dropout, leaky_relu, product
 from tests.reference.dense_jax import group_norm
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 from kmn_jax.models import create_model, encode_object, load_model, save_model
 from tests.reference.clouds import box_cloud
 from tests.reference.networks import TINY

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from kmn_jax.models.pair_head import (
+from kmn_jax.models._pair_head import (
     PairHead,
     kept_pairs,
     pairwise_absolute_fused,
@@ -99,7 +99,7 @@ def test_padding_changes_nothing_and_is_background() -> None:
 @pytest.mark.parametrize("kind", ["shared", "per_pair"])
 def test_dropout_is_unbiased_and_keyed(kind) -> None:
     """The keypoint logits are linear in the second dropout, so that alone leaves their mean as it is."""
-    from kmn_jax.models.pair_head import _per_pair
+    from kmn_jax.models._pair_head import _per_pair
 
     rng = np.random.default_rng(2)
     u, v = jnp.asarray(rng.normal(size=(20, 32)), "f4"), jnp.asarray(rng.normal(size=(4, 32)), "f4")
@@ -122,7 +122,7 @@ def test_dropout_is_unbiased_and_keyed(kind) -> None:
 
 
 def test_dropout_of_every_pair_hides_no_number_that_is_none() -> None:
-    from kmn_jax.models.pair_head import _per_pair
+    from kmn_jax.models._pair_head import _per_pair
 
     u = jnp.zeros((4, 8)).at[1].set(jnp.nan)
     pooled, logits = _per_pair(u, jnp.ones((32, 8)), jnp.ones(8), 0.4, jax.random.key(0))
@@ -146,7 +146,7 @@ def test_pairs_are_kept_at_the_rate_and_independently(rate: float) -> None:
 
 @pytest.mark.parametrize("keypoints", [5, 32, 37])
 def test_dropout_of_every_pair_is_the_dense_one_with_the_same_pairs(keypoints: int) -> None:
-    from kmn_jax.models.pair_head import _per_pair
+    from kmn_jax.models._pair_head import _per_pair
 
     rng = np.random.default_rng(3)
     u, v, w = (jnp.asarray(rng.normal(size=shape), "f4") for shape in [(30, 16), (keypoints, 16), (16,)])

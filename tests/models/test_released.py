@@ -11,7 +11,7 @@ import pytest
 from flax import nnx
 from safetensors.numpy import save_file
 
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 from kmn_jax.models import (
     RELEASED_CONFIG,
     KeyMatchNetConfig,
@@ -25,8 +25,8 @@ from kmn_jax.models import (
     save_model,
     save_released,
 )
-from kmn_jax.models.released import _read
-from kmn_jax.models.torch_file import read_state_dict, state_dict_bytes
+from kmn_jax.models._released import _read
+from kmn_jax.models._torch_file import read_state_dict, state_dict_bytes
 from tests.golden.make_network import GOLDEN, ROWS, draw_inputs, draw_state_dict
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from benchmarks.synthetic import box_surface
-from kmn_jax.checks import InputError
-from kmn_jax.geometry.se3 import (
+from kmn_jax.errors import InputError
+from kmn_jax.geometry import (
     compose,
     from_quaternion_translation,
     pose_error,

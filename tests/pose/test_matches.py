@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 from kmn_jax.pose import MatchConfig, PoseStatus, find_matches, ransac
 
 N, K = 40, 6

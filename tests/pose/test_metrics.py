@@ -3,8 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.checks import InputError
-from kmn_jax.geometry.se3 import compose, random_pose
+from kmn_jax.errors import InputError
+from kmn_jax.geometry import compose, random_pose
 from kmn_jax.pose import (
     add,
     adi,

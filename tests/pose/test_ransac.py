@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from benchmarks.synthetic import synthetic_matches
-from kmn_jax.checks import InputError
-from kmn_jax.geometry.se3 import pose_error
+from kmn_jax.errors import InputError
+from kmn_jax.geometry import pose_error
 from kmn_jax.pose import Matches, PoseStatus, RansacConfig, ransac, ransac_modes
 
 KEY = jax.random.key(7)

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from kmn_jax.data.raycast import bin_triangles
-from kmn_jax.data.scene import Bin, BinScene, Camera
+from kmn_jax.geometry import Camera
+from kmn_jax.simulate import Bin, BinScene
+from kmn_jax.simulate._raycast import bin_triangles
 
 Mesh = tuple[np.ndarray, np.ndarray]
 

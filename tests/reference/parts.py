@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kmn_jax.data.symmetry import Symmetries
-from kmn_jax.estimator.part import Part
+from kmn_jax.objects import Part, Symmetries
 
 HALF = np.array([1.0, 0.5, 0.5])
 

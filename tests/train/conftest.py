@@ -8,7 +8,8 @@ from pathlib import Path
 import jax
 import pytest
 
-from kmn_jax.train.loop import Outcome, train
+from kmn_jax.train import train
+from kmn_jax.train._loop import Outcome
 from tests.train.loop_sample import COMPILED, tiny
 
 

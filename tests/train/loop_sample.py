@@ -14,11 +14,9 @@ import jax
 import numpy as np
 
 from configs import find_config
-from kmn_jax.train.checkpoint import Checkpoints
-from kmn_jax.train.config import TrainConfig
-from kmn_jax.train.records import read_metrics
-from kmn_jax.train.snapshot import Snapshot
-from kmn_jax.train.step import create_state
+from kmn_jax.train import TrainConfig, create_state, read_metrics
+from kmn_jax.train._checkpoint import Checkpoints
+from kmn_jax.train._snapshot import Snapshot
 
 ROOT = Path(__file__).parent.parent.parent
 

@@ -8,10 +8,17 @@ from typing import Any
 import jax
 import numpy as np
 
-from kmn_jax.train.config import TrainConfig
-from kmn_jax.train.sharding import data_mesh, jit_train_step, put_batch, put_number, put_whole
-from kmn_jax.train.sources import training_source
-from kmn_jax.train.step import TrainState, create_state
+from kmn_jax.train import (
+    TrainConfig,
+    create_state,
+    data_mesh,
+    jit_train_step,
+    put_batch,
+    put_number,
+    put_whole,
+    training_source,
+)
+from kmn_jax.train._step import TrainState
 from tests.train.loop_sample import tiny
 
 SHARED = {"pipeline.batch_size": 16}  # a group for each of eight devices

@@ -10,11 +10,11 @@ import jax
 import ml_dtypes
 import numpy as np
 
-from kmn_jax.data.pipeline import BatchIterator, PipelineConfig, SampleBatches
+from kmn_jax.data import BatchIterator, PipelineConfig, SampleBatches
 from kmn_jax.models import KeyMatchNetConfig, create_model
-from kmn_jax.train.optimizer import OptimizerConfig
-from kmn_jax.train.snapshot import Snapshot
-from kmn_jax.train.step import TrainState
+from kmn_jax.train import OptimizerConfig
+from kmn_jax.train._snapshot import Snapshot
+from kmn_jax.train._step import TrainState
 from tests.reference.networks import TINY
 
 

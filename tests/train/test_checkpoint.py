@@ -15,9 +15,9 @@ import jax
 import numpy as np
 import pytest
 
-from kmn_jax.checks import InputError
-from kmn_jax.train.checkpoint import Checkpoints
-from kmn_jax.train.step import TrainState
+from kmn_jax.errors import InputError
+from kmn_jax.train._checkpoint import Checkpoints
+from kmn_jax.train._step import TrainState
 from tests.train.snapshot_sample import (
     DAMAGES,
     TINY,
@@ -137,7 +137,7 @@ def test_what_cannot_be_read_but_is_whole_is_no_damage(
         with pytest.raises(ImportError):
             checkpoints.latest(like)
     with monkeypatch.context() as patch:
-        patch.setattr("kmn_jax.train.snapshot._FORMAT", "kmn_jax snapshot 9")
+        patch.setattr("kmn_jax.train._snapshot._FORMAT", "kmn_jax snapshot 9")
         checkpoints.save(random_snapshot(2, like))
     with pytest.raises(InputError, match=r"step-00000002: .*its format is 'kmn_jax snapshot 9'"):
         checkpoints.latest(like)
@@ -233,7 +233,7 @@ KILLED = """
 import os, sys
 from tests.train.snapshot_sample import random_snapshot, abstract_state
 import orbax.checkpoint
-from kmn_jax.train.checkpoint import Checkpoints
+from kmn_jax.train._checkpoint import Checkpoints
 print("ready", flush=True)
 for line in sys.stdin:
     child = os.fork()  # nothing of JAX has been started yet, only loaded
@@ -294,7 +294,7 @@ EIGHT_DEVICES = """
 import sys, jax, numpy as np
 from dataclasses import replace
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from kmn_jax.train.checkpoint import Checkpoints
+from kmn_jax.train._checkpoint import Checkpoints
 from tests.train.snapshot_sample import abstract_state, assert_same, random_snapshot
 mesh = Mesh(np.array(jax.devices()), ("data",))
 def sharding(leaf):
@@ -326,9 +326,9 @@ from dataclasses import replace
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 port, process, folder = sys.argv[1], int(sys.argv[2]), sys.argv[3]
 jax.distributed.initialize(f"localhost:{port}", 2, process)
-from kmn_jax.checks import InputError
-from kmn_jax.train.checkpoint import Checkpoints
-from kmn_jax.train.snapshot import unpack, pack
+from kmn_jax.errors import InputError
+from kmn_jax.train._checkpoint import Checkpoints
+from kmn_jax.train._snapshot import unpack, pack
 from tests.train.snapshot_sample import TINY, abstract_state, random_snapshot
 mesh = Mesh(np.array(jax.devices()), ("data",))
 def sharding(leaf):

@@ -9,7 +9,7 @@ import pytest
 
 from configs import CONFIGS
 from experiments.train import main
-from kmn_jax.train.loop import Outcome
+from kmn_jax.train._loop import Outcome
 from tests.train.loop_sample import ONE_DEVICE, flags, run_train, tiny
 
 

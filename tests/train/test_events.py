@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-from kmn_jax.train.events import EventFile, crc32c
+from kmn_jax.train._events import EventFile, crc32c
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.checks import InputError
-from kmn_jax.data.crops import CropConfig, draw_crop
-from kmn_jax.data.device_pack import StackedPack, stack_pack, take_scene, visible_points
-from kmn_jax.data.pack import Pack
+from kmn_jax.data import CropConfig, Pack, StackedPack, draw_crop, stack_pack, take_scene, visible_points
+from kmn_jax.errors import InputError
 from kmn_jax.models import KeyMatchNetConfig
-from kmn_jax.train.examples import ExampleConfig, Group, RenderedCrops, make_group
+from kmn_jax.train import ExampleConfig
+from kmn_jax.train._examples import Group, RenderedCrops, make_group
 from tests.reference.meshes import pose, random_rotations
 
 PACK = Path(__file__).parent.parent.parent / "experiments" / "assets" / "small_pack"

@@ -16,14 +16,12 @@ import numpy as np
 import pytest
 
 from experiments.train import main
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 from kmn_jax.models import load_model
-from kmn_jax.train import loop
-from kmn_jax.train.checkpoint import Checkpoints
-from kmn_jax.train.loop import NotFiniteError, Outcome, train
-from kmn_jax.train.records import read_metrics
-from kmn_jax.train.sharding import data_mesh
-from kmn_jax.train.sources import training_source
+from kmn_jax.train import NotFiniteError, data_mesh, read_metrics, train, training_source
+from kmn_jax.train import _loop as loop
+from kmn_jax.train._checkpoint import Checkpoints
+from kmn_jax.train._loop import Outcome
 from tests.train.loop_sample import ONE_DEVICE, assert_same_runs, assert_same_states, flags, newest, run_train, tiny
 
 pytestmark = [

@@ -10,8 +10,8 @@ import numpy as np
 import optax
 import pytest
 
-from kmn_jax.checks import InputError
-from kmn_jax.train.optimizer import OptimizerConfig
+from kmn_jax.errors import InputError
+from kmn_jax.train import OptimizerConfig
 
 
 def test_the_published_schedule_falls_by_steps_to_its_floor() -> None:

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from kmn_jax.train.records import MetricFiles, read_metrics
+from kmn_jax.train import read_metrics
+from kmn_jax.train._records import MetricFiles
 
 
 def test_rows_are_kept_up_to_where_a_run_goes_on(tmp_path: Path) -> None:

@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kmn_jax.checks import InputError
-from kmn_jax.data.crops import CropConfig
-from kmn_jax.data.pipeline import PipelineConfig, SampleBatches
+from kmn_jax.data import CropConfig, PipelineConfig, SampleBatches
+from kmn_jax.errors import InputError
 from kmn_jax.models import KeyMatchNetConfig
-from kmn_jax.train.loop import train
-from kmn_jax.train.records import read_metrics
-from kmn_jax.train.rendered import RenderedFrames, rendered_frames
+from kmn_jax.train import read_metrics, rendered_frames, train
+from kmn_jax.train._rendered import RenderedFrames
 from tests.train.loop_sample import tiny
 
 FOLDER = Path(__file__).parent.parent.parent / "experiments" / "assets" / "small_test_set"

@@ -13,11 +13,10 @@ import jax
 import numpy as np
 import pytest
 
-from kmn_jax.checks import InputError
-from kmn_jax.train.loop import train
-from kmn_jax.train.records import read_metrics
-from kmn_jax.train.sharding import check_batch, data_mesh, initialize_distributed, split_cpu
-from kmn_jax.train.window import MEANS
+from kmn_jax.errors import InputError
+from kmn_jax.train import data_mesh, initialize_distributed, read_metrics, split_cpu, train
+from kmn_jax.train._sharding import check_batch
+from kmn_jax.train._window import MEANS
 from tests.train.loop_sample import ENVIRONMENT, ROOT, flags, newest, run_train, tiny
 from tests.train.sharded_run import SHARED, losses, squared_norm
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kmn_jax.checks import InputError
-from kmn_jax.train.snapshot import join, pack, unpack
+from kmn_jax.errors import InputError
+from kmn_jax.train._snapshot import join, pack, unpack
 from tests.train.snapshot_sample import abstract_state, assert_same, random_snapshot
 
 KERNEL = "parameters/head/context_pair/kernel/value"

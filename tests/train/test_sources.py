@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from configs import find_config
-from kmn_jax.checks import InputError
-from kmn_jax.data.pack import Pack, write_manifest, write_object
-from kmn_jax.train.sources import trained_network
+from kmn_jax.data import Pack
+from kmn_jax.data._pack import write_manifest, write_object
+from kmn_jax.errors import InputError
+from kmn_jax.train._sources import trained_network
 
 DEBUG = find_config("debug")
 SMALL_PACK = Path(__file__).parent.parent.parent / DEBUG.pack

@@ -9,18 +9,11 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from kmn_jax.checks import InputError
+from kmn_jax.errors import InputError
 from kmn_jax.models import KeyMatchNetConfig
-from kmn_jax.train.step import TrainState
-from kmn_jax.train.transfer import FILE_LIMIT, MANIFEST, export_snapshot, import_snapshot
-from tests.train.snapshot_sample import (
-    DAMAGES,
-    abstract_state,
-    assert_same,
-    mixed_state,
-    random_leaf,
-    random_snapshot,
-)
+from kmn_jax.train._step import TrainState
+from kmn_jax.train._transfer import FILE_LIMIT, MANIFEST, export_snapshot, import_snapshot
+from tests.train.snapshot_sample import DAMAGES, abstract_state, assert_same, mixed_state, random_leaf, random_snapshot
 
 
 @pytest.fixture(scope="module")

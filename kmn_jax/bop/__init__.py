@@ -1,0 +1,37 @@
+"""Datasets and result files in BOP format: read, checked and written."""
+
+from kmn_jax.bop._dataset import (
+    BopDataset,
+    BopFrame,
+    BopInstance,
+    FrameKey,
+    dataset_digest,
+    finest_depth_scale,
+    scene_frame,
+    write_camera,
+    write_models,
+    write_scene,
+)
+from kmn_jax.bop._models import NAMES_FILE
+from kmn_jax.bop._results import BopEstimate, write_results
+from kmn_jax.bop._scans import bop_scan, bop_scene_id, bop_sizes, is_bop_image
+
+__all__ = [
+    "NAMES_FILE",
+    "BopDataset",
+    "BopEstimate",
+    "BopFrame",
+    "BopInstance",
+    "FrameKey",
+    "bop_scan",
+    "bop_scene_id",
+    "bop_sizes",
+    "dataset_digest",
+    "finest_depth_scale",
+    "is_bop_image",
+    "scene_frame",
+    "write_camera",
+    "write_models",
+    "write_results",
+    "write_scene",
+]

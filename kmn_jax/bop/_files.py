@@ -1,0 +1,221 @@
+"""The single files of a BOP dataset: strict JSON, depth images and masks, each fault with its file and entry."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Shaped, UInt16
+
+from kmn_jax.errors import InputError
+from kmn_jax.units import METRES, check_unit
+
+SATURATED = 65535  # a 16-bit depth that did not fit, such as the background of BlenderProc: not a measurement
+_DEPTH_MODES = ("I;16", "I;16L", "I;16B", "I", "F")
+
+
+class BopFault(InputError):
+    """A part of a dataset that cannot be used: a file, the entry in it ("" for all of it), and what is wrong."""
+
+    def __init__(self, file: Path, entry: str, what: str) -> None:
+        super().__init__(file, entry, what)
+        self.file, self.entry, self.what = file, entry, what
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.entry}: {self.what}" if self.entry else f"{self.file} {self.what}"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A JSON object, its file, and the name that messages give it. Its readers raise BopFault."""
+
+    file: Path
+    name: str
+    values: Any
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.values, dict):
+            raise self.fault("must be a JSON object with named values")
+
+    def fault(self, what: str) -> BopFault:
+        """Return what is wrong with this entry, to be raised."""
+        return BopFault(self.file, self.name, what)
+
+    def numbers(self, key: str, count: int) -> Float[np.ndarray, " count"]:
+        """Return a list of exactly `count` finite numbers."""
+        value = self._value(key)
+        if not isinstance(value, list) or len(value) != count:
+            has = f"{len(value)} values" if isinstance(value, list) else "no list"
+            raise self.fault(f"{key} must hold {count} numbers, but has {has}")
+        return np.array([self._finite(key, number) for number in value], dtype=np.float64)
+
+    def number(self, key: str) -> float:
+        """Return a finite number."""
+        return self._finite(key, self._value(key))
+
+    def integer(self, key: str) -> int:
+        """Return a whole number."""
+        number = self.number(key)
+        if number != int(number):
+            raise self.fault(f"{key} is {number:g}, but must be a whole number")
+        return int(number)
+
+    def pose(self, rotation: str, translation: str, factor: float) -> Float[np.ndarray, "4 4"]:
+        """Return the pose of a row-wise rotation and a translation, whose lengths are multiplied by `factor`."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.numbers(rotation, 9).reshape(3, 3)
+        pose[:3, 3] = self.numbers(translation, 3) * factor
+        if not is_rotation(pose[:3, :3]):
+            raise self.fault(f"{rotation} is not a rotation: its rows must be orthonormal and right-handed")
+        return pose
+
+    def _value(self, key: str) -> Any:
+        if key not in self.values:
+            raise self.fault(f"{key} is missing")
+        return self.values[key]
+
+    def _finite(self, key: str, value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self.fault(f"{key} holds {str(value)[:40]!r}, which is not a number")
+        if not abs(value) <= sys.float_info.max:
+            raise self.fault(f"{key} holds NaN, infinity or a number beyond them")
+        return float(value)
+
+
+def is_rotation(matrix: Float[np.ndarray, "3 3"]) -> bool:
+    """Tell whether a matrix is a proper rotation, to the digits that pose files carry."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool(np.allclose(matrix.T @ matrix, np.eye(3), rtol=0, atol=5e-3) and np.linalg.det(matrix) > 0)
+
+
+def millimetres(unit: str) -> float:
+    """Return how many millimetres one `unit` is, or raise InputError for an unknown one."""
+    return METRES[check_unit(unit)] / METRES["mm"]
+
+
+def read_json(file: Path) -> Any:
+    """Return what a JSON file holds, NaN included, which `Entry` refuses by name; two values of one key are refused."""
+    content = _content(file)
+    try:
+        return json.loads(content, object_pairs_hook=_object)
+    except (ValueError, RecursionError) as error:
+        raise BopFault(file, "", f"is not valid JSON ({error}): write it again") from None
+
+
+def read_json_by_id(file: Path) -> dict[int, Any]:
+    """Return the entries of a JSON file whose keys are the ids of images or objects, in the order of the ids."""
+    content = read_json(file)
+    if not isinstance(content, dict):
+        raise BopFault(file, "", "must hold a JSON object with an entry for each id")
+    entries: dict[int, Any] = {}
+    for key, value in content.items():
+        if not (key.isascii() and key.isdigit()):
+            raise BopFault(file, f"key {key[:40]!r}", "must be an id, a whole number")
+        if int(key) in entries:
+            raise BopFault(file, f"key {key[:40]!r}", "stands there twice")
+        entries[int(key)] = value
+    return dict(sorted(entries.items()))
+
+
+def json_by_id(entries: Mapping[int, Any]) -> bytes:
+    """Return a JSON file with one line for each id, keys sorted, and every float with all its digits."""
+    lines = [f'  "{key}": {json.dumps(entries[key], sort_keys=True, allow_nan=False)}' for key in sorted(entries)]
+    return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
+
+
+def files_by_id(folder: Path, suffixes: tuple[str, ...], prefix: str = "") -> dict[int, Path]:
+    """Return a folder's files by the number between `prefix` and suffix; none if there is no such folder."""
+    if not folder.is_dir():
+        return {}
+    files = {}
+    for path in sorted(folder.iterdir()):
+        number = path.stem.removeprefix(prefix)
+        if path.suffix.lower() in suffixes and path.stem.startswith(prefix) and number.isascii() and number.isdigit():
+            files[int(number)] = path
+    return files
+
+
+def image_size(file: Path) -> tuple[int, int]:
+    """Return the width and height that an image file announces, without decoding it."""
+    return _open_image(file, decode=False)[2]
+
+
+def read_depth(file: Path, factor: float) -> Float32[np.ndarray, "h w"]:
+    """Return a depth image times `factor`, with 0 where nothing was measured: 0, saturated, negative or not finite."""
+    mode, kind, _, values = _open_image(file, decode=True)
+    if mode not in _DEPTH_MODES or values.ndim != 2:
+        raise BopFault(file, "", f"has {mode} pixels, but a depth image has one channel of 16 or 32 bits")
+    depth = values.astype(np.float64)
+    measured = np.isfinite(depth) & (depth > 0)
+    if mode.startswith("I;16") or kind == "PNG":
+        measured &= depth != SATURATED
+    return np.where(measured, np.where(measured, depth, 0) * factor, 0).astype(np.float32)
+
+
+def read_mask(file: Path) -> Bool[np.ndarray, "h w"]:
+    """Return where a mask image is not black."""
+    mode, _, _, values = _open_image(file, decode=True)
+    if values.ndim != 2:
+        raise BopFault(file, "", f"has {mode} pixels, but a mask has one channel")
+    return values != 0
+
+
+def png_bytes(values: UInt16[np.ndarray, "h w"] | Bool[np.ndarray, "h w"]) -> bytes:
+    """Return a PNG file: 16 bits for numbers, 0 and 255 for booleans. The same pixels give the same bytes."""
+    from PIL import Image
+
+    if values.dtype == np.bool_:
+        values = np.where(values, np.uint8(255), np.uint8(0))
+    file = io.BytesIO()
+    Image.fromarray(values).save(file, "PNG", optimize=False, compress_level=6)
+    return file.getvalue()
+
+
+def pixels(file: Path) -> Shaped[np.ndarray, "..."]:
+    """Return the stored values of an image file of any kind."""
+    return _open_image(file, decode=True)[3]
+
+
+def _open_image(file: Path, decode: bool) -> tuple[str, str | None, tuple[int, int], np.ndarray]:
+    from PIL import Image
+
+    content: Path | io.BytesIO = io.BytesIO(_content(file)) if decode else _checked_file(file)
+    try:
+        with Image.open(content) as image:
+            values = np.asarray(image) if decode else np.zeros((0, 0))
+            return image.mode, image.format, image.size, values
+    except Exception as error:  # each decoder has errors of its own
+        raise BopFault(file, "", f"is not a readable image ({type(error).__name__}: {error}): write it again") from None
+
+
+def _content(file: Path) -> bytes:
+    try:
+        return _checked_file(file).read_bytes()
+    except OSError as error:
+        raise BopFault(file, "", f"cannot be read: {error.strerror}") from None
+
+
+def _checked_file(file: Path) -> Path:
+    try:
+        size = file.stat().st_size
+    except FileNotFoundError:
+        raise BopFault(file, "", "is missing") from None
+    except OSError as error:
+        raise BopFault(file, "", f"cannot be read: {error.strerror}") from None
+    if size == 0:
+        raise BopFault(file, "", "is empty (0 bytes): write it again")
+    return file
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"two values for the key {next(key for key in keys if keys.count(key) > 1)!r}")
+    return result

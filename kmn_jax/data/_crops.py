@@ -1,0 +1,251 @@
+"""Labelled crops for training, inside jit: the points around a visible object point, as a sensor would give them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Shaped
+
+from kmn_jax.geometry import SmoothConfig, nearest, normals_within_radius, orient_to_camera, smoothed, transform_points
+from kmn_jax.simulate import BIN, VisiblePoints
+from kmn_jax.typing import Pose, PRNGKey, Scalar
+
+NormalSource = Literal["estimated", "surface"]
+
+_MOST_SIGMAS = 3.0  # noise is clipped there, as published
+_TINY = 1e-30  # keeps sums of nothing from dividing by zero
+
+
+@dataclass(frozen=True)
+class CropConfig:
+    """Choose what a crop holds; lengths are shares of the object's diameter.
+
+    Normals are those of the CAD "surface", or "estimated" from noisy points as by a sensor, which has more points than
+    a crop keeps: `normal_points` are drawn, those within `normal_radius` define a plane, and `num_points` of them are
+    the crop. (By the 16 nearest of a crop's own 512 points, the median normal would be off by about 20 degrees.)
+    """
+
+    num_points: int = 2048
+    radius: float = 1.0
+    max_noise: float = 0.0075  # the noise's deviation is drawn uniformly between 0 and this
+    normals: NormalSource = "estimated"
+    normal_radius: float = 0.06
+    normal_points: int = 4096
+    smooth: SmoothConfig | None = None  # of estimated normals: the radius is then its own, and points are moved
+    include_bin: bool = True
+    min_points: int = 16  # a crop of fewer is not valid
+    min_visible_fraction: float = 0.1  # of the seed's copy, see VisiblePoints
+    instance_seeds: float = 0.0  # share of seeds that lie on a random copy, whatever picture area it covers
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.min_points <= self.num_points:
+            raise ValueError(f"min_points = {self.min_points} must lie between 1 and num_points = {self.num_points}")
+        if self.radius <= 0 or self.max_noise < 0:
+            raise ValueError(
+                f"radius = {self.radius} must be above zero, and max_noise = {self.max_noise} not below it"
+            )
+        if self.normals not in ("estimated", "surface"):
+            raise ValueError(f'normals = "{self.normals}", but must be "estimated" or "surface"')
+        if self.normal_radius <= 0 or self.normal_points < 3:
+            raise ValueError(
+                f"normal_radius = {self.normal_radius} must be above zero"
+                f" and normal_points = {self.normal_points} at least 3"
+            )
+        if not 0 <= self.instance_seeds <= 1:
+            raise ValueError(f"instance_seeds = {self.instance_seeds} is a share: it must be between 0 and 1")
+
+    @property
+    def num_drawn(self) -> int:
+        """The number of points to draw, of which `num_points` are the crop."""
+        return self.num_points if self.normals == "surface" else max(self.num_points, self.normal_points)
+
+
+class Crop(NamedTuple):
+    """Points around a seed point, which is the origin and the first of them; axes are the camera's.
+
+    If `valid` is false, no visible point may be a seed or too few are around it; all is finite even so.
+    """
+
+    points: Float[Array, "n 3"]
+    normals: Float[Array, "n 3"]  # unit, towards the camera
+    mask: Bool[Array, " n"]  # false for padding, where points and normals are zero
+    is_object: Bool[Array, " n"]  # on the same copy as the seed
+    keypoint: Int[Array, " n"]  # nearest keypoint of that copy; means nothing where is_object is false
+    seed: Float[Array, " 3"]  # in the camera frame
+    instance: Int[Array, ""]  # of the seed
+    T_crop_object: Pose  # of the seed's copy
+    noise: Scalar  # standard deviation per coordinate, in the points' unit
+    num_inside: Int[Array, ""]  # visible points within the radius, of which at most n were drawn
+    valid: Bool[Array, ""]
+
+
+def draw_crop(
+    key: PRNGKey,
+    visible: VisiblePoints,
+    keypoints_object: Float[Array, "k 3"],
+    T_camera_object: Float[Array, "c 4 4"],
+    diameter: Scalar,
+    config: CropConfig = CropConfig(),
+) -> Crop:
+    """Draw a seed among the visible object points, in proportion to the picture area covered, and the crop around it.
+
+    In the configured share of the draws, the seed's copy is drawn first, all being equally likely.
+    """
+    _check_points(visible)
+    seed_key, crop_key = jax.random.split(key)
+    row, found = _draw_seed(seed_key, visible, config)
+    return crop_around(crop_key, visible, row, found, keypoints_object, T_camera_object, diameter, config)
+
+
+def crop_around(
+    key: PRNGKey,
+    visible: VisiblePoints,
+    seed_row: Int[Array, ""],
+    found: Bool[Array, ""],
+    keypoints_object: Float[Array, "k 3"],
+    T_camera_object: Float[Array, "c 4 4"],
+    diameter: Scalar,
+    config: CropConfig = CropConfig(),
+) -> Crop:
+    """Draw the points of a crop around the seed in a row, without replacement; `found` tells whether it is one.
+
+    They are drawn as pixels of an image would be: in proportion to the picture area that each covers. Noise is added
+    before normals are estimated; labels are those of the points without it. Where a normal cannot be estimated (fewer
+    than three points, or all on a line), it is the direction to the camera.
+    """
+    _check_points(visible)
+    draw_key, sigma_key, noise_key = jax.random.split(key, 3)
+    weights = jnp.where(visible.mask, visible.picture_area, 0)
+    x, y, z = (visible.points[:, axis] - visible.points[seed_row, axis] for axis in range(3))
+    inside = found & (weights > 0) & (x**2 + y**2 + z**2 <= (config.radius * diameter) ** 2)
+    if not config.include_bin:
+        inside = inside & (visible.instance != BIN)
+    rows, drawn, kept = _draw_rows(draw_key, jnp.where(inside, weights, 0), seed_row, found, config)
+
+    exact = jnp.where(drawn[:, None], visible.points[rows], 0)
+    sigma = config.max_noise * diameter * jax.random.uniform(sigma_key)
+    noisy = exact + sigma * jnp.clip(jax.random.normal(noise_key, exact.shape), -_MOST_SIGMAS, _MOST_SIGMAS)
+    seed = jnp.where(found, noisy[0], 0)
+    noisy = jnp.where(drawn[:, None], noisy - seed[None], 0)
+
+    mask = drawn[: kept.shape[0]]
+    rows, exact, points = rows[kept], exact[kept], noisy[kept]
+    if config.normals == "surface":
+        normals, known = visible.normals[rows], mask
+    elif config.smooth is not None:
+        points, normals, known, _ = smoothed(points, mask, noisy, drawn, diameter, config.smooth)
+        seed, points = seed + points[0], jnp.where(mask[:, None], points - points[:1], 0)
+    else:
+        normals, known = normals_within_radius(points, noisy, config.normal_radius * diameter, drawn)
+    normals = jnp.where(mask[:, None], camera_normals(points, normals, known, -seed), 0)
+
+    instance = jnp.where(found, visible.instance[seed_row], 0)
+    pose = jnp.where(found, T_camera_object[instance].astype(jnp.float32), jnp.eye(4))
+    keypoint, _ = nearest(exact, transform_points(pose, keypoints_object))
+    num_inside = inside.sum(dtype=jnp.int32)
+
+    def padded(rows: Shaped[Array, "drawn ..."]) -> Shaped[Array, "n ..."]:
+        return jnp.pad(rows, ((0, config.num_points - rows.shape[0]), *((0, 0) for _ in rows.shape[1:])))
+
+    return Crop(
+        points=padded(points),
+        normals=padded(normals),
+        mask=padded(mask),
+        is_object=padded(mask & (visible.instance[rows] == instance)),
+        keypoint=padded(keypoint.astype(jnp.int32)),
+        seed=seed,
+        instance=instance,
+        T_crop_object=pose.at[:3, 3].add(-seed),
+        noise=sigma,
+        num_inside=num_inside,
+        valid=num_inside >= config.min_points,
+    )
+
+
+def camera_normals(
+    points: Float[Array, "n 3"], normals: Float[Array, "n 3"], known: Bool[Array, " n"], camera: Float[Array, "3"]
+) -> Float[Array, "n 3"]:
+    """Return normals turned towards a camera; where one is not known, the direction to it."""
+    return jnp.where(known[:, None], orient_to_camera(points, normals, camera), _unit(camera[None] - points))
+
+
+def _check_points(visible: VisiblePoints) -> None:
+    if visible.mask.shape[0] < 1:
+        raise ValueError("visible holds no points: a scene needs at least one copy and one surfel")
+
+
+def _draw_seed(key: PRNGKey, visible: VisiblePoints, config: CropConfig) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+    """Return the row of a random point on a copy of which enough is visible, and whether there is one."""
+    place_key, share_key, copy_key = jax.random.split(key, 3)
+    on_copy = visible.instance != BIN
+    enough = visible.visible_fraction >= config.min_visible_fraction
+    some = visible.mask & (visible.picture_area > 0) & on_copy & enough[jnp.where(on_copy, visible.instance, 0)]
+    weights = jnp.where(some, visible.picture_area, 0)
+    if config.instance_seeds > 0:
+        drawable = enough & (visible.visible_fraction > 0)
+        copy = jax.random.categorical(copy_key, jnp.where(drawable, 0.0, -jnp.inf))
+        whole = jax.random.uniform(share_key) >= config.instance_seeds
+        weights = jnp.where(whole | (visible.instance == copy), weights, 0)
+    # In whole numbers, whose running sums never fall and are exact.
+    ends = jnp.cumsum((weights * (2.0**30 / jnp.maximum(weights.sum(), _TINY))).astype(jnp.int32))
+    place = jax.random.randint(place_key, (), 0, jnp.maximum(ends[-1], 1))
+    row = jnp.searchsorted(ends, place, side="right")
+    return jnp.minimum(row, ends.shape[0] - 1), ends[-1] > 0
+
+
+def _draw_rows(
+    key: PRNGKey, weights: Float[Array, " r"], seed_row: Int[Array, ""], found: Bool[Array, ""], config: CropConfig
+) -> tuple[Int[Array, " drawn"], Bool[Array, " drawn"], Int[Array, " n"]]:
+    """Return rows to draw, the seed's first; which of them there are, all in front; and which become the crop.
+
+    Both draws are in proportion to the weights, as far as no row can be drawn twice: where the many for the normals
+    include all of the heavy rows, the few of the crop still prefer them.
+    """
+    many_key, few_key = jax.random.split(key)
+    others = min(config.num_drawn, weights.shape[0]) - 1
+    weights = weights.at[seed_row].set(0)
+    likely = _likelihoods(weights, others)
+    rows, there = _systematic(many_key, likely, others)
+    again = jnp.where(there, weights[rows] / jnp.where(there, likely[rows], 1), 0)
+    few = min(config.num_points - 1, others)
+    chosen, _ = _systematic(few_key, _likelihoods(again, few), few)
+    total = there.sum(dtype=jnp.int32)
+    kept = jnp.where(total > few, chosen, jnp.arange(few, dtype=jnp.int32))
+    rows = jnp.concatenate([seed_row[None].astype(jnp.int32), rows])
+    return rows, jnp.concatenate([found[None], there]), jnp.concatenate([jnp.zeros(1, dtype=jnp.int32), 1 + kept])
+
+
+def _systematic(
+    key: PRNGKey, likely: Float[Array, " r"], count: int
+) -> tuple[Int[Array, " count"], Bool[Array, " count"]]:
+    """Draw rows without replacement, each as likely as said, and tell which of the `count` there are.
+
+    Rows lie side by side, each as long as it is likely, and one point in every unit of length, all at one random
+    distance from its beginning, names a row.
+    """
+    if count == 0:
+        return jnp.zeros(0, dtype=jnp.int32), jnp.zeros(0, dtype=bool)
+    unit = min(2**16, 2**30 // count)
+    ends = jnp.cumsum(jnp.ceil(likely * unit).astype(jnp.int32))
+    places = jax.random.randint(key, (), 0, unit) + unit * jnp.arange(count, dtype=jnp.int32)
+    rows = jnp.minimum(jnp.searchsorted(ends, places, side="right"), likely.shape[0] - 1).astype(jnp.int32)
+    return rows, places < ends[-1]
+
+
+def _likelihoods(weights: Float[Array, " r"], count: int) -> Float[Array, " r"]:
+    """Return how likely each row is drawn: in proportion to its weight, at most 1, about `count` in sum."""
+    scale = count / jnp.maximum(weights.sum(), _TINY)
+    for _ in range(3):  # what one row cannot have falls to the others
+        full = weights * scale >= 1
+        rest = jnp.maximum(jnp.where(full, 0, weights).sum(), _TINY)
+        scale = jnp.maximum(scale, (count - full.sum(dtype=jnp.float32)) / rest)
+    some = weights > 0
+    return jnp.where(some, jnp.where(some.sum() <= count, 1, jnp.minimum(weights * scale, 1)), 0)
+
+
+def _unit(vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    length = jnp.sqrt((vectors**2).sum(axis=1, keepdims=True))
+    return vectors / jnp.where(length > 0, length, 1)

@@ -1,0 +1,115 @@
+"""What of a scene is still to be searched: where no seed is near and no likely pose explains the points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from kmn_jax.detection._candidates import Candidates
+from kmn_jax.detection._frames import into
+from kmn_jax.detection._scene import Scene
+from kmn_jax.errors import InputError
+from kmn_jax.objects import Part
+
+_LEAST_CROWD = 16  # points of a cell: fewer make no crop
+_SURFACE_POINTS = 1024  # on a part
+
+
+@dataclass(frozen=True)
+class CoverageConfig:
+    """When a place counts as searched; lengths are shares of the object's diameter."""
+
+    explained: float = 0.05  # points so near to the surface of a found part are done
+    searched: float = 0.5  # those so near to a seed
+    searched_finely: float = 0.2  # the same, as long as rounds find new copies
+    patience: int | None = 2  # rounds that find none, after which it is not searched finely; None goes on
+    cell: float = 0.4  # points are stray if few others lie in their cell
+
+    def __post_init__(self) -> None:
+        """Refuse values that contradict their meaning."""
+        if not 0 < self.searched_finely <= self.searched or not min(self.explained, self.cell) > 0:
+            raise InputError(
+                f"explained = {self.explained}, searched_finely = {self.searched_finely} and cell = {self.cell} must be"
+                f" above zero, and searched = {self.searched} not below searched_finely"
+            )
+        if self.patience is not None and self.patience < 1:
+            raise InputError(f"patience = {self.patience} must be at least 1, or none")
+
+
+class Coverage(NamedTuple):
+    """The state of a search."""
+
+    left: Bool[np.ndarray, " r"]  # of the scene's points: foreground that no likely pose explains
+    away: Float[np.ndarray, " r"]  # from the nearest seed; it is not kept up where a point is not left
+    places: Float[np.ndarray, "p 3"]  # centres of likely poses
+    barren: int  # rounds since a copy was found
+
+
+def nothing_covered(scene: Scene) -> Coverage:
+    """Return the state before the first round."""
+    return Coverage(scene.foreground.copy(), np.full(len(scene.points), np.inf), np.zeros((0, 3)), 0)
+
+
+def cover(
+    before: Coverage,
+    scene: Scene,
+    part: Part,
+    found: Candidates,
+    score: Float[np.ndarray, " s"],
+    reach: float,
+    config: CoverageConfig,
+) -> Coverage:
+    """Return the state after a round; scores above zero are those of likely poses, farther apart than `reach`."""
+    from scipy.spatial import cKDTree
+
+    rows = np.flatnonzero(before.left)
+    away = before.away.copy()
+    distance, _ = cKDTree(np.asarray(found.searched.crops.seed)).query(scene.points[rows])
+    away[rows] = np.minimum(away[rows], distance)
+
+    centers = (found.T_view_object @ np.append((part.minimum + part.maximum) / 2, 1))[:, :3]
+    likely = _one_a_place(centers, score, reach)
+    size = min(len(part.points), _SURFACE_POINTS)
+    surface, near = cKDTree(part.points[:size]), config.explained * part.diameter + float(np.sqrt(part.area / size))
+    for row in likely:
+        local = into(found.T_view_object[row].astype(np.float64), scene.points[rows])
+        inside = np.flatnonzero(((local >= part.minimum - near) & (local <= part.maximum + near)).all(axis=1))
+        distance, _ = surface.query(local[inside], distance_upper_bound=near)
+        rows = np.delete(rows, inside[np.isfinite(distance)])
+    left = np.zeros_like(before.left)
+    left[rows] = True
+
+    new = [row for row in likely if (np.linalg.norm(before.places - centers[row], axis=1) > reach).all()]
+    places = np.concatenate([before.places, centers[new]])
+    return Coverage(left, away, places, 0 if new else before.barren + 1)
+
+
+def to_search(state: Coverage, scene: Scene, part: Part, config: CoverageConfig) -> Bool[np.ndarray, " r"]:
+    """Return the points to spread the next seeds over, without stray ones; none when the search is done."""
+    far = _crowded(state.left & (state.away > config.searched * part.diameter), scene, part, config)
+    if far.any() or (config.patience is not None and state.barren >= config.patience):
+        return far
+    return _crowded(state.left & (state.away > config.searched_finely * part.diameter), scene, part, config)
+
+
+def _crowded(
+    chosen: Bool[np.ndarray, " r"], scene: Scene, part: Part, config: CoverageConfig
+) -> Bool[np.ndarray, " r"]:
+    rows = np.flatnonzero(chosen)
+    cells = np.floor(scene.points[rows] / (config.cell * part.diameter)).astype(np.int64)
+    _, which, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    result = np.zeros_like(chosen)
+    result[rows[counts[which.reshape(-1)] >= _LEAST_CROWD]] = True
+    return result
+
+
+def _one_a_place(centers: Float[np.ndarray, "s 3"], score: Float[np.ndarray, " s"], reach: float) -> list[int]:
+    """Return rows of the best poses whose centres are apart; scores of zero do not count."""
+    chosen: list[int] = []
+    for row in np.argsort(-score, kind="stable")[: int((score > 0).sum())].tolist():
+        if (np.linalg.norm(centers[chosen] - centers[row], axis=1) > reach).all():
+            chosen.append(row)
+    return chosen

@@ -1,0 +1,99 @@
+"""Results for people and programs: a table, JSON and BOP's csv."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kmn_jax.bop import BopEstimate, write_results
+from kmn_jax.detection._result import SCHEMA_VERSION, Detection, Detections
+from kmn_jax.files import write_whole
+
+_COLUMNS = ("rank", "probability", "visible", "gap", "inliers", "x", "y", "z", "rotation vector (degrees)")
+
+
+def as_json(found: Detections, object_name: str, scene_name: str, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a result as JSON values, see docs/estimate.md; `facts`, such as the command's settings, are added."""
+    return {
+        "version": SCHEMA_VERSION,
+        "unit": found.unit,
+        "object": object_name,
+        "scene": scene_name,
+        "poses": [_pose_json(pose) for pose in found.poses],
+        "timing": {
+            "total_s": found.timing.total,
+            "compile_s": found.timing.compile,
+            **{f"{stage}_s": seconds for stage, seconds in found.timing.stages.items()},
+        },
+        "reason": found.reason,
+        "warnings": list(found.warnings),
+        **facts,
+    }
+
+
+def _pose_json(pose: Detection) -> dict[str, Any]:
+    return {
+        "T_scene_object": pose.T_scene_object.tolist(),
+        "probability": pose.probability,
+        "inliers": pose.num_inliers,
+        "visible_fraction": pose.visible_fraction,
+        "runner_up_gap": pose.runner_up_gap,
+        "explained": pose.explained,
+        "violated": pose.violated,
+        "occluded": pose.occluded,
+        "unknown": pose.unknown,
+        "seed": pose.seed.tolist(),
+        "warnings": list(pose.warnings),
+    }
+
+
+def write_json(found: Mapping[str, Any], path: str | Path) -> None:
+    """Write JSON values to a file that appears whole."""
+    write_whole(path, (json.dumps(found, indent=1, allow_nan=False) + "\n").encode())
+
+
+def write_bop_csv(
+    found: Detections, path: str | Path, scene_id: int = 0, image_id: int = 0, object_id: int = 1
+) -> None:
+    """Write a result as rows of BOP's csv; the score is the probability, the time that of the whole image."""
+    seconds = found.timing.total
+    estimates = [
+        BopEstimate(scene_id, image_id, object_id, pose.probability, pose.T_scene_object, seconds)
+        for pose in found.poses
+    ]
+    write_results(path, estimates, found.unit)
+
+
+def table(found: Detections, accepted: float) -> str:
+    """Return a result as text for a terminal."""
+    lines = [f"note: {warning}" for warning in found.warnings]
+    if found.poses:
+        likely = sum(pose.probability >= accepted for pose in found.poses)
+        lines.append(f"{found.part}: {likely} found, {len(found.poses) - likely} doubtful (lengths in {found.unit})")
+        rows = [_COLUMNS, *(_row(rank, pose) for rank, pose in enumerate(found.poses, start=1))]
+        widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
+        lines += ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+        lines += sorted({f"note: {warning}" for pose in found.poses for warning in pose.warnings})
+    else:
+        lines.append(f"{found.part}: nothing found, because {found.reason}")
+    stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in found.timing.stages.items())
+    running = found.timing.total - found.timing.compile
+    lines.append(f"{running:.2f} s ({stages}) and {found.timing.compile:.2f} s of compiling")
+    return "\n".join(lines)
+
+
+def _row(rank: int, pose: Detection) -> tuple[str, ...]:
+    x, y, z = pose.T_scene_object[:3, 3]
+    turn = ", ".join(f"{angle:.1f}" for angle in np.degrees(_rotation_vector(pose.T_scene_object[:3, :3])))
+    numbers = (f"{pose.probability:.2f}", f"{pose.visible_fraction:.2f}", f"{pose.runner_up_gap:.2f}")
+    return (str(rank), *numbers, str(pose.num_inliers), f"{x:.4g}", f"{y:.4g}", f"{z:.4g}", turn)
+
+
+def _rotation_vector(rotation: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(rotation).as_rotvec())

@@ -1,0 +1,183 @@
+"""Reading CAD meshes and object clouds from files, with their unit, and refusing what is broken."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import logging
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float64, Int, Int32, Int64
+
+from kmn_jax.errors import InputError
+from kmn_jax.io._clouds import parse_pcd, parse_xyz
+from kmn_jax.io._obj import parse_obj
+from kmn_jax.io._ply import parse_ply
+from kmn_jax.io._step import step_to_glb
+from kmn_jax.io._stl import parse_stl
+from kmn_jax.units import check_unit
+
+MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb", ".step", ".stp")
+CLOUD_SUFFIXES = (".ply", ".pcd", ".xyz", ".xyzn")
+_FARTHEST = 1e18  # the squares of longer lengths leave float32
+_OWN_UNIT = {".glb": "m", ".step": "m", ".stp": "m"}  # STEP files state theirs; cascadio converts it to metres
+
+
+_Parsed = tuple[Float64[np.ndarray, "v 3"], Float64[np.ndarray, "v 3"] | None, Int64[np.ndarray, "t 3"]]
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles as a file holds them, or a cloud if there are none. Frame and winding are the file's own."""
+
+    vertices: Float64[np.ndarray, "v 3"]
+    triangles: Int32[np.ndarray, "t 3"]
+    normals: Float64[np.ndarray, "v 3"] | None  # of a cloud whose file has them, all of them finite
+    unit: str
+
+
+def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
+    """Read a mesh (STL, OBJ, PLY, GLB, STEP) or a point cloud (PLY without faces, PCD, XYZ).
+
+    GLB and STEP files state their unit and come in metres. The others have none: `unit` says what theirs is,
+    millimetres unless given, as nearly all CAD files are. A unit given for GLB or STEP must be metres.
+    Raises InputError if the file is missing, of another format, empty, truncated, or holds NaN or bad indices.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES + CLOUD_SUFFIXES:
+        known = ", ".join(dict.fromkeys(MESH_SUFFIXES + CLOUD_SUFFIXES))
+        raise InputError(f"{path}: the format {suffix or 'without a suffix'} is not known: use one of {known}")
+    own = _OWN_UNIT.get(suffix)
+    if own and unit not in (None, own):
+        raise InputError(f"{path}: {suffix} files are read in metres, so the unit cannot be {unit}: leave it out")
+    unit = check_unit((own or "mm") if unit is None else unit)
+    content = read_file(path)
+    try:
+        vertices, normals, triangles = _parse(content, suffix)
+        if len(triangles) == 0 and suffix not in CLOUD_SUFFIXES:
+            raise InputError(f"it holds no triangles: it is empty, truncated or not a {suffix} file")
+        check_triangles(vertices, triangles)
+    except InputError as error:
+        raise InputError(f"{path} cannot be used: {error}") from None
+    except MemoryError:
+        raise InputError(f"{path} cannot be used: it does not fit into memory") from None
+    if len(triangles) or (normals is not None and not np.isfinite(normals).all()):
+        normals = None
+    return Mesh(vertices, triangles.astype(np.int32), normals, unit)
+
+
+def parse_points(content: bytes, suffix: str) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the points of a PLY, PCD or XYZ file's content, as they are, and their normals if it has any.
+
+    Raises InputError, without the file's name, if it is not of that format or truncated.
+    """
+    points, normals, _ = _parse(content, suffix)
+    return points, normals
+
+
+def read_file(path: Path, what: str = "a CAD file") -> bytes:
+    """Return the content of a file, or raise InputError if it is missing, not a file, or empty."""
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path} is {'a folder' if path.is_dir() else 'not a regular file'}: name {what}")
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from None
+    except ValueError as error:  # a null character
+        raise InputError(f"{str(path)!r} cannot be read: {error}") from None
+    if not content:
+        raise InputError(f"{path} is empty (0 bytes): name {what}")
+    return content
+
+
+def _parse(content: bytes, suffix: str) -> _Parsed:
+    none = np.zeros((0, 3), np.int64)
+    if suffix == ".stl":
+        vertices = parse_stl(content).reshape(-1, 3)
+        return vertices, None, np.arange(len(vertices)).reshape(-1, 3)
+    if suffix == ".obj":
+        vertices, triangles = parse_obj(content)
+        return vertices, None, triangles
+    if suffix == ".ply":
+        return parse_ply(content)
+    if suffix == ".pcd":
+        return *parse_pcd(content), none
+    if suffix in (".xyz", ".xyzn"):
+        return *parse_xyz(content, with_normals=suffix == ".xyzn"), none
+    if suffix == ".glb":
+        return _parse_glb(content)
+    return _parse_glb(step_to_glb(content))
+
+
+def _parse_glb(content: bytes) -> _Parsed:
+    if content[:4] != b"glTF" or int.from_bytes(content[8:12], "little") != len(content):
+        raise InputError("it is truncated, or not a GLB file")
+    _check_counts(content)
+    import trimesh
+
+    try:
+        with _quiet("trimesh"):
+            # Merged, primitives of which only some have a material make the reader fail.
+            scene = trimesh.load_scene(io.BytesIO(content), file_type="glb", process=False, merge_primitives=False)
+            parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+            vertices = [np.asarray(part.vertices, dtype=np.float64) for part in parts]
+            starts = np.cumsum([0] + [len(part) for part in vertices])
+            triangles = [
+                np.asarray(part.faces, dtype=np.int64) + start for part, start in zip(parts, starts, strict=False)
+            ]
+    except Exception as error:  # the reader has no error of its own, but all that Python has
+        reason = str(error).strip().partition("\n")[0][:120]
+        raise InputError(f"it is damaged ({type(error).__name__}: {reason})") from None
+    if not parts:
+        return np.zeros((0, 3)), None, np.zeros((0, 3), np.int64)
+    if any(array.shape[1:] != (3,) for array in (*vertices, *triangles)):
+        raise InputError("it is damaged: its positions or triangles are not three numbers each")
+    return np.concatenate(vertices), None, np.concatenate(triangles)
+
+
+def _check_counts(content: bytes) -> None:
+    """Refuse a GLB file that announces more of anything than it has bytes: the reader would make it up of zeros."""
+    try:
+        tree = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+        most = max((int(accessor["count"]) for accessor in tree.get("accessors", ())), default=0)
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+        raise InputError(f"it is damaged: its header cannot be read ({type(error).__name__})") from None
+    if most > len(content):
+        raise InputError(f"it is damaged: it announces {most} values, but has {len(content)} bytes")
+
+
+def check_triangles(vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]) -> None:
+    """Raise InputError for no vertices, NaN, infinite or huge ones, and for triangles that name others."""
+    if len(vertices) == 0:
+        raise InputError("there are no points")
+    bad = ~(np.abs(vertices) <= _FARTHEST).all(axis=1)
+    if bad.any():
+        raise InputError(
+            f"{bad.sum()} of {len(bad)} vertices are NaN, infinite or beyond {_FARTHEST:g}, the first is number"
+            f" {int(bad.argmax())}: export the part again"
+        )
+    if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(vertices)):
+        raise InputError(
+            f"triangles name vertices from {triangles.min()} to {triangles.max()}, but there are 0 to"
+            f" {len(vertices) - 1}: export the part again"
+        )
+
+
+@contextlib.contextmanager
+def _quiet(logger: str) -> Iterator[None]:
+    """Keep a reader's log and warnings from the user: what matters is reported as an error."""
+    log = logging.getLogger(logger)
+    before = log.disabled
+    log.disabled = True
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.disabled = before

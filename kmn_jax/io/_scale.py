@@ -1,0 +1,167 @@
+"""Whether the lengths of an object and of a scene can belong together, and which unit would make them fit.
+
+Files of clouds and depth images state no unit, and a wrong one is the commonest mistake with them. Nothing is changed
+here, and no unit is guessed in silence: `resolve_unit` takes what was asked for, `length_problem` tells in one sentence
+if that cannot be true. Its limits leave room for a single part and for a large bin of small ones. So a mistake by 1000
+is found always, as it leads from one limit beyond the other, but one by 10 or 25.4 only for scenes near to a limit; and
+centimetres and inches are too much alike to be told apart, so that the sentence names what else would fit.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kmn_jax.errors import InputError
+from kmn_jax.io._scans import Scan
+from kmn_jax.units import METRES, check_unit
+
+AUTO = "auto"
+_NAMES = {"mm": "millimetres", "cm": "centimetres", "m": "metres", "in": "inches"}
+_PERCENTILES = (1, 99)  # of each axis: what lies beyond may be stray points
+_SAMPLE = 2_000  # points whose neighbours are looked for
+_MOST = 1_000_000  # points to look for them among
+
+# What can be, each in diameters of the object: a view of a single part shows half of it at least, and a part that is
+# far smaller than its scene, or not wider than three points are apart, cannot be found in it.
+_EXTENT = (1 / 3, 200.0)
+_DISTANCE = (1 / 3, 500.0)
+_POINTS_ACROSS = 3.0
+
+# What is usual; it only ranks units that can be. First in diameters, then in metres.
+_USUAL_EXTENT, _USUAL_DISTANCE = (0.7, 20.0), (3.0, 40.0)
+_USUAL_SIZES = {"object": (0.003, 0.5), "scene": (0.03, 2.0), "distance": (0.15, 3.0)}
+_RARE = {"mm": 0.0, "m": 0.2, "in": 0.7, "cm": 1.0}
+_RARE_MISTAKE = {"scene": 0.0, "object": 0.5}
+_CLOSE = 1.0  # candidates that are not much more unusual than the best one are named, too
+
+
+@dataclass(frozen=True)
+class SceneSize:
+    """How large a scene is, in `unit`."""
+
+    extent: float  # diagonal of the axis-aligned box around its points, without the outermost 1% along each axis
+    spacing: float  # median distance of a point to the nearest other one
+    distance: float | None  # median distance from the sensor, if it is known where that was
+    unit: str
+
+
+def resolve_unit(asked: str, object_unit: str, stated: str | None = None) -> str:
+    """Return the unit of a scene's lengths: mm, cm, m or in.
+
+    `asked` is one of them, or auto: then it is the unit that the file's format states, such as mm of a BOP image, and
+    if it states none that of the object. What is returned is still to be checked by `length_problem`. Raises InputError
+    for an unknown unit, and for one that contradicts the format.
+    """
+    if asked == AUTO:
+        return check_unit(object_unit if stated is None else stated)
+    if asked not in METRES:
+        raise InputError(f"unit {asked!r} is not known: use one of {', '.join((AUTO, *METRES))}")
+    if stated not in (None, asked):
+        raise InputError(f"the scene's unit cannot be {asked}, as its format states {stated}: leave --units out")
+    return asked
+
+
+def scene_size(scan: Scan) -> SceneSize:
+    """Measure a scan, a large one by a million of its points. Its distance is known if it is a depth image."""
+    from scipy.spatial import cKDTree
+
+    generator, points = np.random.default_rng(0), scan.points
+    if len(points) > _MOST:
+        points = points[np.unique(generator.integers(0, len(points), _MOST))]
+    low, high = np.percentile(points.astype(np.float64), _PERCENTILES, axis=0)
+    spacing = 0.0
+    if len(points) > 1:
+        chosen = points if len(points) <= _SAMPLE else generator.choice(points, _SAMPLE, replace=False)
+        nearest = cKDTree(points).query(chosen, k=2)[0][:, 1]
+        # Fewer points of a surface are farther apart, by the root of their share.
+        spacing = float(np.median(nearest)) * math.sqrt(len(points) / len(scan.points))
+    distance = None
+    if scan.camera is not None:
+        distance = float(np.median(np.linalg.norm(points.astype(np.float64), axis=1)))
+    return SceneSize(float(np.linalg.norm(high - low)), spacing, distance, scan.unit)
+
+
+def length_problem(diameter: float, object_unit: str, scene: SceneSize) -> str | None:
+    """Tell in a sentence why an object of that diameter cannot be in a scene, None if it can.
+
+    If another unit makes them fit, of the scene or else of the object, the sentence names the most usual one with its
+    factor, and others that would do as well. Raises InputError for an unknown unit or a diameter of zero or less.
+    """
+    if not 0 < diameter < math.inf:
+        raise InputError(f"diameter is {diameter}, but must be above zero and finite")
+    fault = _fault(diameter, check_unit(object_unit), scene, scene.unit)
+    if fault is None:
+        return None
+    candidates = []
+    for which, old in (("scene", scene.unit), ("object", object_unit)):
+        for unit in METRES:
+            pair = (unit, scene.unit) if which == "object" else (object_unit, unit)
+            if unit != old and _fault(diameter, pair[0], scene, pair[1]) is None:
+                oddity = _oddity(diameter, pair[0], scene, pair[1]) + _RARE_MISTAKE[which]
+                candidates.append((oddity, which, unit, METRES[unit] / METRES[old]))
+    if not candidates:
+        return (
+            f"{fault}, and no other unit of {', '.join(METRES)} makes them fit: check that both are what they should be"
+        )
+    least, which, unit, factor = min(candidates)
+    change = f"{factor:.4g} times larger" if factor > 1 else f"{1 / factor:.4g} times smaller"
+    other = [f"{_NAMES[name]} for the {what}" for odd, what, name, _ in sorted(candidates)[1:] if odd < least + _CLOSE]
+    too = f" ({', '.join(other)} would fit, too)" if other else ""
+    say = f"say --{'units' if which == 'scene' else 'object-units'} {unit}"
+    return f"{fault}: the {which} would fit {change}, so its lengths are probably {_NAMES[unit]}{too}: {say}"
+
+
+def length_doubt(diameter: float, object_unit: str, scene: SceneSize) -> str | None:
+    """Tell in a clause which other unit of the scene would be more usual, None if none would.
+
+    It is for scenes in which nothing was found: their lengths can be right, but need not be.
+    """
+    oddities = {unit: _oddity(diameter, object_unit, scene, unit) for unit in METRES}
+    possible = [unit for unit in METRES if _fault(diameter, object_unit, scene, unit) is None]
+    likeliest = min(possible, key=lambda unit: oddities[unit], default=scene.unit)
+    if oddities[likeliest] >= oddities[scene.unit]:
+        return None
+    return f"if the scan's lengths are {_NAMES[likeliest]}, not {_NAMES[scene.unit]}, say --units {likeliest}"
+
+
+def _fault(diameter: float, object_unit: str, scene: SceneSize, scene_unit: str) -> str | None:
+    """Say what cannot be if the lengths of both were in the given units."""
+    factor = METRES[scene_unit] / METRES[object_unit]
+    extent, spacing = scene.extent * factor, scene.spacing * factor
+    named = f"the object of {_digits(diameter)} {object_unit}"
+    shown = f"the scene of {_digits(scene.extent)} {scene_unit}"
+    if extent < _EXTENT[0] * diameter:
+        return f"{named} is larger than {shown}"
+    if extent > _EXTENT[1] * diameter:
+        return f"{named} is far too small for {shown}"
+    if diameter < _POINTS_ACROSS * spacing:
+        return f"{named} is too small for a scene whose points are {_digits(scene.spacing)} {scene_unit} apart"
+    if scene.distance is None:
+        return None
+    away = f"a scene {_digits(scene.distance)} {scene_unit} away"
+    if scene.distance * factor < _DISTANCE[0] * diameter:
+        return f"{named} is too large for {away}"
+    return f"{named} is too small for {away}" if scene.distance * factor > _DISTANCE[1] * diameter else None
+
+
+def _oddity(diameter: float, object_unit: str, scene: SceneSize, scene_unit: str) -> float:
+    """Return how unusual lengths in these units would be: logarithms of what they miss, added."""
+    one, other = METRES[object_unit], METRES[scene_unit]
+    total = _beyond(scene.extent * other / (diameter * one), _USUAL_EXTENT)
+    total += _beyond(diameter * one, _USUAL_SIZES["object"]) + _beyond(scene.extent * other, _USUAL_SIZES["scene"])
+    if scene.distance is not None:
+        total += _beyond(scene.distance * other / (diameter * one), _USUAL_DISTANCE)
+        total += _beyond(scene.distance * other, _USUAL_SIZES["distance"])
+    return total + _RARE[object_unit] + _RARE[scene_unit]
+
+
+def _beyond(value: float, limits: tuple[float, float]) -> float:
+    return max(0.0, math.log(limits[0] / value), math.log(value / limits[1]))
+
+
+def _digits(value: float) -> str:
+    """Return the first three digits of a length."""
+    return f"{float(f'{value:.3g}'):g}"

@@ -1,0 +1,364 @@
+"""Scans as sensors write them: clouds and depth images, with their invalid values, in one form."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import json
+import subprocess
+import sys
+import tempfile
+import warnings
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from kmn_jax.errors import InputError
+from kmn_jax.geometry import Camera, measured_points
+from kmn_jax.io._meshes import CLOUD_SUFFIXES, parse_points, read_file
+from kmn_jax.units import METRES, check_unit
+
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
+ARRAY_SUFFIXES = (".npy", ".npz")
+_SATURATED = 65535  # of 16-bit depth, which some readers return as wider numbers: nothing was measured
+_MOST_POINTS = 50_000_000
+_FARTHEST = 1e9  # units: renderers write 1e10 where they see nothing
+_DENSEST = 4096  # bytes of pixels from one byte of a file: compression that does more packs no measurement
+_SECONDS = 120  # for an EXR file, which takes less than one
+_DEPTH_NAMES = ("z", "depth")  # of a channel among others
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What a sensor at the origin measured, in its frame (x right, y down, z forward for depth images).
+
+    `points` are finite and not the origin. Normals are those of the file, unit, or none.
+    """
+
+    points: Float32[np.ndarray, "n 3"]
+    normals: Float32[np.ndarray, "n 3"] | None
+    depth: Float32[np.ndarray, "h w"] | None  # zero where nothing was measured
+    camera: Camera | None
+    unit: str
+
+    def in_unit(self, unit: str) -> Scan:
+        """Return the same scan with its lengths in another unit."""
+        factor = np.float32(METRES[self.unit] / METRES[check_unit(unit)])
+        depth = None if self.depth is None else self.depth * factor
+        return Scan(self.points * factor, self.normals, depth, self.camera, unit)
+
+
+def read_scan(path: str | Path, unit: str, camera: str | Path | None = None) -> Scan:
+    """Read a cloud (PLY, PCD, XYZ, NPY, NPZ) or a depth image (PNG, TIFF, EXR, NPY, NPZ), with lengths in `unit`.
+
+    Arrays are (n, 3), (n, 6) or organised (h, w, 3), (h, w, 6): points, then normals; or (h, w): depth. In an NPZ file
+    they are called `points`, `normals` and `depth`, and `K` may hold the intrinsics. Of an EXR file its only channel is
+    read, or the one called Z or depth. Depth needs a camera file, see `read_camera`, whose `depth_scale` turns stored
+    values into `unit`. Points that are not finite, at the origin or beyond 1e9, and depths that are zero, negative,
+    not finite, saturated or beyond 1e9, were not measured and are left out.
+
+    Raises InputError if a file is missing, of another format, truncated, or if nothing in it was measured.
+    """
+    path, unit = Path(path), check_unit(unit)
+    suffix = path.suffix.lower()
+    if suffix not in (*CLOUD_SUFFIXES, *DEPTH_SUFFIXES, *ARRAY_SUFFIXES):
+        known = ", ".join(dict.fromkeys((*CLOUD_SUFFIXES, *DEPTH_SUFFIXES, *ARRAY_SUFFIXES)))
+        raise InputError(
+            f"{path}: the format {suffix or 'without a suffix'} is not known for scans: use one of {known}"
+        )
+    content = read_file(path, "a scan")
+    try:
+        if suffix in CLOUD_SUFFIXES:
+            points, normals = parse_points(content, suffix)
+            return _cloud(points, normals, unit)
+        if suffix in DEPTH_SUFFIXES:
+            intrinsics = _needed(camera)
+            return depth_scan(_exr(content) if suffix == ".exr" else _image(content), intrinsics, unit)
+        arrays = _npz(content) if suffix == ".npz" else _named(_npy(content))
+        has_camera = camera is not None or "K" in arrays
+        if "depth" in arrays and (has_camera or "points" not in arrays):
+            inside = camera is None and has_camera
+            given = _intrinsics(arrays["K"], "K", 1.0, None) if inside else _needed(camera)
+            return depth_scan(arrays["depth"], given, unit)
+        return _cloud(arrays["points"], arrays.get("normals"), unit)
+    except InputError as error:
+        raise InputError(f"{path} cannot be used: {error}") from None
+    except MemoryError:
+        raise InputError(f"{path} cannot be used: it does not fit into memory") from None
+
+
+@dataclass(frozen=True)
+class DepthCamera:
+    """The intrinsics of a depth image, before its size is known, and what its stored values are multiplied by."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    depth_scale: float
+    size: tuple[int, int] | None  # width, height
+
+
+def read_camera(path: str | Path) -> DepthCamera:
+    """Read intrinsics: JSON with fx, fy, cx, cy or a row-wise `cam_K` of 9 numbers, and perhaps depth_scale and size.
+
+    The centre of the first pixel has the coordinates (0, 0). Raises InputError for anything else.
+    """
+    path = Path(path)
+    content = read_file(path, "a camera file")
+    try:
+        found = json.loads(content.decode("utf-8"))
+        if not isinstance(found, dict):
+            raise ValueError("it is no JSON object")
+        scale = float(found.get("depth_scale", 1.0))
+        size = (int(found["width"]), int(found["height"])) if "width" in found and "height" in found else None
+        if "cam_K" in found:
+            matrix = np.asarray(found["cam_K"], dtype=float).ravel()
+            if len(matrix) != 9:
+                raise ValueError(f"cam_K has {len(matrix)} numbers instead of 9")
+            return _intrinsics(matrix.reshape(3, 3), "cam_K", scale, size)
+        return _camera([float(found[name]) for name in ("fx", "fy", "cx", "cy")], scale, size)
+    except KeyError as error:
+        raise InputError(f"{path} cannot be used: it has no {error}, give fx, fy, cx and cy, or cam_K") from None
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise InputError(f"{path} cannot be used as a camera: {error}") from None
+
+
+def _camera(numbers: list[float], scale: float, size: tuple[int, int] | None) -> DepthCamera:
+    if not np.isfinite([*numbers, scale]).all() or min(numbers[:2]) <= 0 or scale <= 0:
+        raise InputError(
+            f"fx, fy = {numbers[0]}, {numbers[1]} and depth_scale = {scale} must be above zero, and all finite"
+        )
+    fx, fy, cx, cy = numbers
+    return DepthCamera(fx, fy, cx, cy, scale, size)
+
+
+def _needed(camera: str | Path | None) -> DepthCamera:
+    if camera is None:
+        raise InputError("it is a depth image, which needs a camera file with fx, fy, cx and cy")
+    return read_camera(camera)
+
+
+def _intrinsics(matrix: np.ndarray, name: str, scale: float, size: tuple[int, int] | None) -> DepthCamera:
+    if matrix.shape != (3, 3):
+        raise InputError(f"{name} has shape {matrix.shape}, but must be (3, 3)")
+    (fx, skew, cx), (zero, fy, cy), last = matrix.astype(float).tolist()
+    if (skew, zero, *last) != (0, 0, 0, 0, 1):
+        raise InputError(f"{name} must be fx 0 cx 0 fy cy 0 0 1, row by row: a camera with skew is not supported")
+    return _camera([fx, fy, cx, cy], scale, size)
+
+
+def _image(content: bytes) -> np.ndarray:
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(io.BytesIO(content), formats=("PNG", "TIFF")) as image:
+                _check_size(image.width * image.height, 2, content)
+                values = np.asarray(image)
+    except InputError:
+        raise
+    except Exception as error:  # each decoder has errors of its own
+        raise InputError(f"it is not a readable image ({type(error).__name__})") from None
+    if values.ndim != 2 or values.dtype == np.uint8 or values.dtype == bool:
+        kind = f"{values.dtype} with {values.shape[2] if values.ndim == 3 else 1} channels"
+        raise InputError(f"it holds {kind}, but depth has one channel of 16 bits or more")
+    return values
+
+
+def _check_size(count: int, itemsize: int, content: bytes) -> None:
+    """Refuse what announces more pixels or points than can be true, before memory is taken for them."""
+    if count > _MOST_POINTS:
+        raise InputError(f"it has {count} pixels or points, more than {_MOST_POINTS}: thin it out")
+    if count * itemsize > _DENSEST * len(content):
+        raise InputError(f"it is damaged: it announces {count} pixels or points, but has {len(content)} bytes")
+
+
+# A process of its own: a fault in the decoder, which is C++, ends only that, and what it prints goes nowhere.
+_EXR_PROGRAM = f"""
+import signal, sys
+if hasattr(signal, "alarm"):
+    signal.alarm({_SECONDS})
+import numpy as np
+import OpenEXR
+source, target, most = sys.argv[1:]
+with OpenEXR.File(source, header_only=True) as file:
+    announced = len(file.parts)
+    for part in file.parts:
+        low, high = (np.asarray(corner, dtype=float) for corner in part.header["dataWindow"])
+        if np.prod(high - low + 1) > int(most):
+            sys.exit(3)
+found, windows = [], []
+with OpenEXR.File(source, separate_channels=True) as file:
+    if not 0 < announced == len(file.parts):  # a part that cannot be decoded is missing, without an exception
+        sys.exit(4)
+    for part in file.parts:
+        for name, channel in part.channels.items():
+            found.append((name, channel.pixels))
+            windows.append([part.header["dataWindow"], part.header["displayWindow"]])
+pixels = {{f"p{{i}}": found[i][1] for i in range(len(found)) if found[i][1].dtype != object}}
+np.savez(target, names=np.array([name for name, _ in found], dtype=str), windows=np.array(windows), **pixels)
+"""
+
+
+def _exr(content: bytes) -> np.ndarray:
+    """Return the depth channel of an EXR file's content, zero where its window is smaller than the image."""
+    if content[:4] != b"\x76\x2f\x31\x01":
+        raise InputError("it is not an EXR file")
+    if importlib.util.find_spec("OpenEXR") is None:
+        raise InputError("EXR files need a reader that is not installed: pip install 'kmn_jax[data]'")
+    most = min(_MOST_POINTS, _DENSEST * len(content) // 2)
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            source, target = Path(folder, "depth.exr"), Path(folder, "depth.npz")
+            source.write_bytes(content)
+            command = [sys.executable, "-P", "-c", _EXR_PROGRAM, str(source), str(target), str(most)]
+            code = subprocess.run(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                timeout=_SECONDS,
+            ).returncode
+            if code == 3:
+                raise InputError(f"it announces more than {most} pixels: it is damaged or too large")
+            if code == 0 and target.exists():
+                with np.load(target) as found:
+                    return _depth_channel(dict(found))
+    except subprocess.TimeoutExpired:
+        raise InputError(f"its decoding takes longer than {_SECONDS} s: save it as TIFF") from None
+    except OSError as error:
+        raise InputError(f"it cannot be decoded: {error}") from None
+    raise InputError(f"it is truncated or damaged (the decoder ended with code {code})")
+
+
+def _depth_channel(found: dict[str, np.ndarray]) -> np.ndarray:
+    names = [str(name) for name in found["names"]]
+    chosen = [i for i, name in enumerate(names) if name.rpartition(".")[2].lower() in _DEPTH_NAMES]
+    if len(names) == 1:
+        chosen = [0]
+    if len(chosen) != 1 or f"p{chosen[0]}" not in found:
+        shown = ", ".join(names)[:80] or "none that can be read"
+        raise InputError(f"its channels are {shown}: save the depth alone, or as one channel called Z")
+    pixels, (low, high) = found[f"p{chosen[0]}"], found["windows"][chosen[0], 0].astype(np.int64)
+    start, end = found["windows"][chosen[0], 1].astype(np.int64)  # of the image that the camera took
+    if pixels.shape != tuple((high - low + 1)[::-1]):
+        raise InputError(f"its channel {names[chosen[0]]} is subsampled: save it in full")
+    first, last = np.maximum(low, start), np.minimum(high, end)
+    if (last < first).any() or int(np.prod(end - start + 1)) > _MOST_POINTS:
+        raise InputError("its data window does not lie in its display window: save it with one window")
+    image = np.zeros((end - start + 1)[::-1], dtype=pixels.dtype)
+    (left, top), (right, bottom) = first - start, last - start + 1
+    inner = first - low
+    image[top:bottom, left:right] = pixels[inner[1] :, inner[0] :][: bottom - top, : right - left]
+    return image
+
+
+def _npy(content: bytes) -> np.ndarray:
+    """Return the array of an NPY file's content. No memory is taken for what its header only announces."""
+    file = io.BytesIO(content)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of files by Python 2
+            version = np.lib.format.read_magic(file)
+            if version not in ((1, 0), (2, 0)):
+                raise ValueError(f"version {version} holds no plain numbers")
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, by_columns, dtype = read(file)
+    except Exception as error:  # of many kinds: the header is Python text
+        raise InputError(f"it is not a readable .npy file ({type(error).__name__}: {str(error)[:80]})") from None
+    if dtype.kind not in "fiu":
+        raise InputError(f"it does not hold numbers, but {dtype.name} values")
+    count = 1
+    for size in shape:
+        count *= size
+    if min(shape, default=0) < 0 or count * dtype.itemsize > len(content) - file.tell():
+        raise InputError(f"it is not a readable .npy file: it is truncated, or not of shape {shape}"[:200])
+    array = np.frombuffer(content, dtype, count, file.tell()) if count else np.zeros(0, dtype)
+    return array.reshape(shape, order="F" if by_columns else "C")
+
+
+def _npz(content: bytes) -> dict[str, np.ndarray]:
+    arrays, names = {}, []
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            for entry in archive.infolist():
+                name = entry.filename.removesuffix(".npy")
+                names.append(name)
+                if name in ("points", "normals", "depth", "K"):
+                    _check_size(entry.file_size // (6 * 8), 6 * 8, content)
+                    arrays[name] = _npy(archive.read(entry))
+    except InputError:
+        raise
+    except Exception as error:  # of the archive, and of what unpacks it
+        raise InputError(f"it is not a readable .npz file ({type(error).__name__}: {str(error)[:80]})") from None
+    if not arrays.keys() & {"points", "depth"}:
+        raise InputError(f"it holds {', '.join(names)[:80] or 'nothing'}, but neither points nor depth")
+    return arrays
+
+
+def _named(array: np.ndarray) -> dict[str, np.ndarray]:
+    return {"depth" if array.ndim == 2 and array.shape[1] not in (3, 6) else "points": array}
+
+
+def _cloud(points: np.ndarray, normals: np.ndarray | None, unit: str) -> Scan:
+    if points.ndim not in (2, 3) or points.shape[-1] not in (3, 6):
+        raise InputError(f"its points have shape {points.shape}, but must be (n, 3), (n, 6), (h, w, 3) or (h, w, 6)")
+    if points.shape[-1] == 6 and normals is None:
+        points, normals = points[..., :3], points[..., 3:]
+    rows = points[..., :3].reshape(-1, 3)
+    if len(rows) > _MOST_POINTS:
+        raise InputError(f"it has {len(rows)} points, more than {_MOST_POINTS}: thin it out")
+    if normals is not None and normals.reshape(-1, 3).shape != rows.shape:
+        raise InputError(f"its normals have shape {normals.shape}, but its points {points.shape}")
+    with np.errstate(over="ignore", invalid="ignore"):
+        rows = rows.astype(np.float32)
+        real = (np.abs(rows) < _FARTHEST).all(axis=1) & (rows != 0).any(axis=1)
+    if not real.any():
+        raise InputError(f"none of its {len(rows)} points was measured: all are NaN, infinite, far beyond or zero")
+    return Scan(rows[real], None if normals is None else _unit(normals.reshape(-1, 3)[real]), None, None, unit)
+
+
+def _unit(normals: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"] | None:
+    """Return normals of length one; none if some are missing."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        normals = normals.astype(np.float32)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+    if not (np.isfinite(length).all() and (length > 0).all()):
+        return None
+    return (normals / length).astype(np.float32)
+
+
+def depth_scan(values: np.ndarray, camera: DepthCamera, unit: str) -> Scan:
+    """Return the scan of a depth image (h, w) as it was stored; `depth_scale` turns its values into `unit`.
+
+    Raises InputError if nothing in it was measured, or if the camera is that of another size.
+    """
+    if values.ndim != 2:
+        raise InputError(f"its depth has shape {values.shape}, but must be (h, w)")
+    height, width = values.shape
+    if camera.size is not None and camera.size != (width, height):
+        raise InputError(f"it has {width} x {height} pixels, but its camera {camera.size[0]} x {camera.size[1]}")
+    if values.size > _MOST_POINTS:
+        raise InputError(f"it has {values.size} pixels, more than {_MOST_POINTS}: make it smaller")
+    measured = _measured(values)
+    if not measured.any():
+        raise InputError(f"none of its {height} x {width} pixels was measured: all are zero, NaN or saturated")
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        depth = (np.where(measured, values, 0).astype(np.float64) * camera.depth_scale).astype(np.float32)
+        sensor = Camera(camera.fx, camera.fy, camera.cx, camera.cy, width, height)
+        points = measured_points(depth, sensor)
+    if not len(points) or not (np.abs(points) < _FARTHEST).all():
+        raise InputError(f"its depths in {unit}, or their points, are tiny or huge: check depth_scale, fx, fy and unit")
+    return Scan(points, None, depth, sensor, unit)
+
+
+def _measured(values: np.ndarray) -> Bool[np.ndarray, "h w"]:
+    if values.dtype.kind in "iu":
+        return (values > 0) & (values != _SATURATED) & (values != np.iinfo(values.dtype).max)
+    most = np.finfo(np.float16).max if values.dtype == np.float16 else _FARTHEST  # half floats stop at 65504
+    return np.isfinite(values) & (values > 0) & (values < most)

@@ -1,0 +1,91 @@
+"""Masked losses and accuracies of the two outputs (arXiv 2303.16102, training section)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from kmn_jax.geometry import nearest
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the two cross entropies; the published ones."""
+
+    segmentation_weight: float = 0.2
+    keypoint_weight: float = 0.8
+
+    def __post_init__(self) -> None:
+        weights = (self.segmentation_weight, self.keypoint_weight)
+        if min(weights) < 0 or max(weights) <= 0:
+            raise ValueError(f"loss weights are {weights}, but none may be negative and one must be above zero")
+
+
+class MatchingLoss(NamedTuple):
+    """Loss and accuracies of one crop. What nothing was counted for is zero; the counts say so.
+
+    Attributes:
+        total: weighted sum of the two cross entropies, in nats.
+        segmentation, keypoint: mean cross entropy over real points, and over real points of the object.
+        segmentation_accuracy, keypoint_accuracy: share of the same points whose largest logit is the label.
+        num_points, num_object_points: how many points the means are over.
+    """
+
+    total: Float[Array, ""]
+    segmentation: Float[Array, ""]
+    keypoint: Float[Array, ""]
+    segmentation_accuracy: Float[Array, ""]
+    keypoint_accuracy: Float[Array, ""]
+    num_points: Int[Array, ""]
+    num_object_points: Int[Array, ""]
+
+
+def matching_loss(
+    segmentation_logits: Float[Array, "n 2"],
+    keypoint_logits: Float[Array, "n k"],
+    on_object: Bool[Array, " n"],
+    keypoint_labels: Int[Array, " n"],
+    mask: Bool[Array, " n"] | None = None,
+    config: LossConfig = LossConfig(),
+) -> MatchingLoss:
+    """Return losses and accuracies of one crop.
+
+    `on_object` marks the points on the seed's instance; the keypoint loss counts only those, whatever label
+    the others carry. Points where `mask` is false count nowhere.
+    """
+    real = jnp.ones_like(on_object) if mask is None else mask
+    scored = real & on_object
+    labels = jnp.where(scored, keypoint_labels, 0)
+    segmentation, segmentation_accuracy = _mean_cross_entropy(segmentation_logits, on_object.astype(jnp.int32), real)
+    keypoint, keypoint_accuracy = _mean_cross_entropy(keypoint_logits, labels, scored)
+    return MatchingLoss(
+        config.segmentation_weight * segmentation + config.keypoint_weight * keypoint,
+        segmentation,
+        keypoint,
+        segmentation_accuracy,
+        keypoint_accuracy,
+        real.sum(),
+        scored.sum(),
+    )
+
+
+def keypoint_labels(
+    scene_points: Float[Array, "n 3"], keypoints_scene: Float[Array, "k 3"]
+) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
+    """Return for each scene point its nearest keypoint of the instance (both in the scene frame) and the distance."""
+    return nearest(scene_points, keypoints_scene)
+
+
+def _mean_cross_entropy(
+    logits: Float[Array, "n c"], labels: Int[Array, " n"], counted: Bool[Array, " n"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    logits = jnp.where(counted[:, None], logits, 0)  # before the softmax: padding must not reach the gradient either
+    log_probability = jax.nn.log_softmax(logits.astype(jnp.float32), axis=1)
+    entropy = -jnp.take_along_axis(log_probability, labels[:, None], axis=1)[:, 0]
+    count = jnp.maximum(counted.sum(), 1).astype(jnp.float32)
+    right = (logits.argmax(axis=1) == labels) & counted
+    return jnp.where(counted, entropy, 0).sum() / count, right.sum().astype(jnp.float32) / count

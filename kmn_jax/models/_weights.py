@@ -1,0 +1,86 @@
+"""Our own model files: safetensors with our parameter names, the config as JSON in the header."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from kmn_jax.errors import InputError
+from kmn_jax.files import read_safetensors, write_whole
+from kmn_jax.models._keymatchnet import KeyMatchNetConfig, Model, model_structure
+
+_CONFIG_KEY = "kmn_jax.config"
+
+
+def save_model(model: tuple[nnx.GraphDef, nnx.State], path: str | Path) -> None:
+    """Write parameters and config to a .safetensors file."""
+    tensors = {
+        ".".join(map(str, path)): np.ascontiguousarray(value[...]) for path, value in nnx.to_flat_state(model[1])
+    }
+    config = json.dumps(dataclasses.asdict(Model(*model).config))
+    write_whole(path, save(tensors, metadata={_CONFIG_KEY: config}))
+
+
+def is_model_file(path: str | Path) -> bool:
+    """Tell whether the file is one of ours (rather than published weights in safetensors form)."""
+    try:
+        with safe_open(str(path), "np") as file:
+            return _CONFIG_KEY in (file.metadata() or {})
+    except (SafetensorError, OSError):
+        return False
+
+
+def released_file(name: str) -> Path:
+    """Return the file of a released model, one of those in `kmn_jax/pretrained/`.
+
+    Raises InputError if there is none of that name.
+    """
+    folder = Path(__file__).parent.parent / "pretrained"
+    path = folder / f"{name}.safetensors"
+    if not path.is_file():
+        names = ", ".join(sorted(file.stem for file in folder.glob("*.safetensors"))) or "none"
+        raise InputError(f"there is no released model {name!r}: there are {names}")
+    return path
+
+
+def load_pretrained(name: str = "small") -> Model:
+    """Load a released model; a card beside its file tells what it can do. Raises InputError if there is none."""
+    return load_model(released_file(name))
+
+
+def load_model(path: str | Path) -> Model:
+    """Load a model that `save_model` wrote.
+
+    Raises:
+        InputError: missing or damaged file, not one of ours, or a config that this version does not know.
+    """
+    tensors, metadata = read_safetensors(path)
+    if _CONFIG_KEY not in metadata:
+        raise InputError(f"{path} carries no kmn_jax config: if it holds published weights, use load_released")
+    try:
+        config = KeyMatchNetConfig(**json.loads(metadata[_CONFIG_KEY]))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path} has a config that this version of kmn_jax cannot use: {error}") from None
+    graphdef, parameters = model_structure(config)
+    flat = dict(nnx.to_flat_state(parameters))
+    wanted = {".".join(map(str, target)): target for target in flat}
+    problems = [f"{name} is missing" for name in wanted if name not in tensors]
+    problems += [f"{name} is unknown" for name in tensors if name not in wanted]
+    problems += [
+        f"{name} has shape {tensors[name].shape}, but the network needs {flat[target].shape}"
+        for name, target in wanted.items()
+        if name in tensors and tensors[name].shape != flat[target].shape
+    ]
+    if problems:
+        raise InputError(f"{path} does not fit its own config: {'; '.join(problems[:8])}")
+    return Model(
+        graphdef,
+        nnx.from_flat_state({t: flat[t].replace(jnp.asarray(tensors[name])) for name, t in wanted.items()}),
+    )

@@ -1,0 +1,266 @@
+"""Rotations that map an object onto itself, found from its geometry.
+
+Such a rotation fixes the centroid of the surface, and its second moments. So an axis of order three or more is a
+principal axis whose other two moments are equal, an axis of order two is a principal axis or lies in a plane of equal
+moments, and only where all three are equal need every direction be tried.
+
+Rotations near to a symmetry hold too, within the tolerance. What is returned is therefore built as one of the finite
+rotation groups (cyclic, dihedral, tetrahedral, octahedral, icosahedral), all of whose members hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from kmn_jax.errors import InputError
+
+Distance = Callable[[np.ndarray], np.ndarray]  # (n, 3) points to (n,) distances from the surface
+
+_MAX_ORDER = 36
+_PRIMES = (2, 3, 5, 7, 11, 13)  # every order tried is a multiple of one of these
+_COARSE_POINTS = 256
+_SAME_AXIS = np.cos(np.radians(6))
+# Angles between neighbouring axes of order 5 in the icosahedral group, 4 in the octahedral, 3 in the tetrahedral one.
+_POLYHEDRAL = ((5, np.arctan(2)), (4, np.pi / 2), (3, np.arccos(1 / 3)))
+
+
+@dataclass(frozen=True)
+class Symmetries:
+    """Rotational symmetries of an object, in its frame and unit; all rotations are about `center`."""
+
+    rotations: Float[np.ndarray, "s 3 3"]  # discrete ones, the identity first
+    axes: Float[np.ndarray, "c 3"]  # unit directions about which every angle is a symmetry
+    center: Float[np.ndarray, "3"]
+    tolerance: float  # largest distance of a rotated surface point from the surface, a share of the diameter
+
+    @property
+    def transforms(self) -> Float[np.ndarray, "s 4 4"]:
+        """The discrete symmetries as poses `T_object_object`."""
+        result = np.tile(np.eye(4), (len(self.rotations), 1, 1))
+        result[:, :3, :3] = self.rotations
+        result[:, :3, 3] = self.center - self.rotations @ self.center
+        return result
+
+
+def find_symmetries(
+    points: Float[np.ndarray, "n 3"],
+    center: Float[np.ndarray, "3"],
+    moments: Float[np.ndarray, "3 3"],
+    distance: Distance,
+    diameter: float,
+    tolerance: float = 0.02,
+) -> Symmetries:
+    """Return the rotations under which every surface point stays within `tolerance` diameters of the surface.
+
+    `center` and `moments` are the surface's area centroid and covariance, `points` lie on it, `distance` returns
+    the distances of points from it. Orders up to 36 are tried; an axis that passes them all is continuous, one
+    that fails some is not, however fine its teeth. With a continuous axis only rotations that are not about it are
+    listed: one half turn across it, if that is a symmetry. The discrete rotations are the largest group found; an
+    order counts only if its rotations fit clearly better than others about the axis.
+    Raises InputError for a tolerance outside of (0, 0.2].
+    """
+    if not 0 < tolerance <= 0.2:
+        raise InputError(f"tolerance = {tolerance} must be a share of the diameter above 0 and at most 0.2")
+    search = _Search(points, center, distance, float(tolerance * diameter))
+    values, vectors = np.linalg.eigh(moments)
+    # A rotation that moves no point further than the bound from the surface changes no spread by more.
+    spreads = np.sqrt(np.maximum(values, 0))
+    equal = [abs(spreads[i] - spreads[j]) <= search.bound for i, j in ((1, 2), (0, 2), (0, 1))]
+    isotropic = equal[1]  # the smallest and the largest
+    axes = np.concatenate([vectors.T, _sphere_directions(1500)]) if isotropic else vectors.T
+    spins: list[_Spin] = []
+    for prime in (5, 3, 2) if isotropic else _PRIMES:
+        for start in search.nearly(axes, prime):
+            if any(abs(start @ spin.axis) > _SAME_AXIS and spin.order % prime == 0 for spin in spins):
+                continue
+            axis = search.refined(start, prime)
+            if search.is_continuous(axis):
+                return search.about_continuous(axis, tolerance)
+            order = search.order_about(axis)
+            if order > prime:  # the higher order knows the axis better
+                finer = search.refined(axis, order)
+                axis = finer if search.all_hold(_cyclic(finer, order)) else axis
+            if order > 1:
+                spins.append(_Spin(axis, order))
+    if not isotropic:
+        spins += [_Spin(vectors[:, index], 1) for index in range(3) if equal[index]]
+    return Symmetries(search.largest_group(spins), np.zeros((0, 3)), center, tolerance)
+
+
+def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
+    """Return the right-handed rotation about a unit axis by an angle in radians."""
+    x, y, z = axis
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
+
+
+class _Spin(NamedTuple):
+    axis: np.ndarray
+    order: int
+
+
+class _Search:
+    def __init__(
+        self, points: Float[np.ndarray, "n 3"], center: Float[np.ndarray, "3"], distance: Distance, bound: float
+    ) -> None:
+        self.points, self.center, self.distance, self.bound = points - center, center, distance, bound
+        # The outermost points tell most rotations apart, whatever their number.
+        order = np.argsort(-np.linalg.norm(self.points, axis=1), kind="stable")
+        self.coarse = self.points[np.concatenate([order[:_COARSE_POINTS], order[:: max(1, len(order) // 256)]])]
+
+    def deviation(self, rotation: Float[np.ndarray, "3 3"], points: Float[np.ndarray, "n 3"] | None = None) -> float:
+        points = self.points if points is None else points
+        return float(self.distance(points @ rotation.T + self.center).max())
+
+    def deviations(
+        self, rotations: Float[np.ndarray, "r 3 3"], points: Float[np.ndarray, "n 3"]
+    ) -> Float[np.ndarray, " r"]:
+        turned = np.einsum("rij,nj->rni", rotations, points).reshape(-1, 3) + self.center
+        return self.distance(turned).reshape(len(rotations), -1).max(axis=1)
+
+    def holds(self, rotation: Float[np.ndarray, "3 3"]) -> bool:
+        return self.deviation(rotation, self.coarse) <= self.bound and self.deviation(rotation) <= self.bound
+
+    def is_continuous(self, axis: Float[np.ndarray, "3"]) -> bool:
+        orders = range(2, _MAX_ORDER + 1)
+        return all(self.holds(_turn(axis, order)) for order in orders)
+
+    def order_about(self, axis: Float[np.ndarray, "3"]) -> int:
+        """Return the largest order whose rotations all hold, and fit clearly better than any others about the axis.
+
+        On an axis that is nearly continuous, rotations in between the true ones hold now and then too; those that make
+        a group of a wrong order come at least two thirds of the way to the worst one.
+        """
+        limit = None
+        for order in range(_MAX_ORDER, 1, -1):
+            group = _cyclic(axis, order)
+            if self.deviation(group[1], self.coarse) > self.bound or not self.all_hold(group):
+                continue
+            if limit is None:
+                some = np.stack([rotation_about(axis, angle) for angle in np.radians(np.arange(5, 181, 5))])
+                limit = 0.6 * float(self.deviations(some, self.coarse).max())
+            if self.deviations(group, self.coarse).max() <= limit:
+                return order
+        return 1
+
+    def about_continuous(self, axis: Float[np.ndarray, "3"], tolerance: float) -> Symmetries:
+        """Return the symmetries of a body of revolution: about its axis, maybe turned over, maybe a sphere."""
+        across = _across(axis)[0]
+        turned_over = [_half_turn(across)] if self.holds(_half_turn(across)) else []
+        if turned_over and all(self.holds(rotation_about(across, angle)) for angle in (0.4, 1.1, 2.0)):
+            return Symmetries(np.eye(3)[None], np.eye(3), self.center, tolerance)
+        return Symmetries(np.stack([np.eye(3), *turned_over]), axis[None], self.center, tolerance)
+
+    def nearly(self, axes: Float[np.ndarray, "a 3"], order: int) -> Float[np.ndarray, "b 3"]:
+        """Return the axes whose rotation of this order comes near to a symmetry, the 24 nearest at most, in order.
+
+        Near is three times the tolerance: a grid of directions misses an axis by about two degrees, which moves the
+        outermost points by 3% of the size.
+        """
+        for points in (self.coarse[:: len(self.coarse) // 32], self.coarse):
+            if len(axes):
+                deviations = self.deviations(np.stack([_turn(axis, order) for axis in axes]), points)
+                axes = axes[np.argsort(deviations, kind="stable")[: (deviations <= 3 * self.bound).sum()]]
+        return axes[:24]
+
+    def refined(
+        self, axis: Float[np.ndarray, "3"], order: int, about: Float[np.ndarray, "3"] | None = None
+    ) -> Float[np.ndarray, "3"]:
+        """Turn an axis, in any way or only about another one, to where its rotation fits best, by halving steps."""
+        best, step = self.deviation(_turn(axis, order), self.coarse), np.radians(1.5)
+        while step > np.radians(0.02):
+            sides = _across(axis) if about is None else (np.cross(about, axis),)
+            trials = [axis + step * way for side in sides for way in (side, -side)]
+            trials = [trial / np.linalg.norm(trial) for trial in trials]
+            scores = self.deviations(np.stack([_turn(trial, order) for trial in trials]), self.coarse)
+            if scores.min() < best:
+                best, axis = float(scores.min()), trials[int(scores.argmin())]
+            else:
+                step /= 2
+        return axis
+
+    def all_hold(self, group: Float[np.ndarray, "s 3 3"]) -> bool:
+        middle = len(group) // 2  # about an axis, the rotation by about half a turn tells most
+        return all(self.holds(rotation) for rotation in (*group[middle:], *group[1:middle]))
+
+    def largest_group(self, spins: list[_Spin]) -> Float[np.ndarray, "s 3 3"]:
+        """Return the largest group, all of whose members hold, to which axes and their orders lead."""
+        for order, angle in _POLYHEDRAL:
+            axes = [spin.axis for spin in spins if spin.order % order == 0]
+            for first, second in combinations(axes, 2):
+                second = second if first @ second > 0 else -second
+                if abs(np.arccos(min(1.0, first @ second)) - angle) < np.radians(6):
+                    group = _polyhedral(first, second, order, angle)
+                    if self.all_hold(group):
+                        return group
+        best = np.eye(3)[None]
+        for axis, order in sorted(spins, key=lambda spin: -spin.order):
+            if 2 * order <= len(best):
+                break
+            if order > len(best):
+                best = _cyclic(axis, order)
+            others = [spin.axis for spin in spins if abs(spin.axis @ axis) < 0.1]
+            for way in self.nearly(np.stack([*others, *_around(axis, 180)]), 2):
+                way = way - way @ axis * axis
+                turn = _half_turn(self.refined(way / np.linalg.norm(way), 2, about=axis))
+                dihedral = np.concatenate([_cyclic(axis, order), turn @ _cyclic(axis, order)])
+                if self.all_hold(dihedral):
+                    best = dihedral
+                    break
+        return best
+
+
+def _turn(axis: Float[np.ndarray, "3"], order: int) -> Float[np.ndarray, "3 3"]:
+    return rotation_about(axis, 2 * np.pi / order)
+
+
+def _half_turn(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    return 2 * np.outer(axis, axis) - np.eye(3)
+
+
+def _cyclic(axis: Float[np.ndarray, "3"], order: int) -> Float[np.ndarray, "s 3 3"]:
+    return np.stack([rotation_about(axis, 2 * np.pi * index / order) for index in range(order)])
+
+
+def _polyhedral(
+    first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"], order: int, angle: float
+) -> Float[np.ndarray, "s 3 3"]:
+    """Return the group that two axes span, the second one moved to the exact angle from the first."""
+    across = second - second @ first * first
+    second = np.cos(angle) * first + np.sin(angle) * across / np.linalg.norm(across)
+    generators = [_turn(first, order), _turn(second, order)]
+    group = [np.eye(3)]
+    for member in group:  # which grows
+        for product in (member @ generator for generator in generators):
+            if np.einsum("nij,ij->n", np.stack(group), product).max() < 2.9:  # 3 for equal ones, 2.6 for neighbours
+                group.append(product)
+    return np.stack(group)
+
+
+def _around(axis: Float[np.ndarray, "3"], count: int) -> Float[np.ndarray, "n 3"]:
+    """Return directions across an axis; half a turn of them suffices, as axes have no sign."""
+    first, second = _across(axis)
+    angles = np.pi * np.arange(count) / count
+    return np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second
+
+
+def _across(axis: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Return two unit directions that with a unit axis are right-handed."""
+    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    first /= np.linalg.norm(first)
+    return first, np.cross(axis, first)
+
+
+def _sphere_directions(count: int) -> Float[np.ndarray, "n 3"]:
+    """Return evenly spread directions on a half sphere, the coordinate axes first."""
+    index = np.arange(count) + 0.5
+    height, angle = 1 - index / count, np.pi * (1 + 5**0.5) * index
+    radius = np.sqrt(1 - height**2)
+    spread = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+    return np.concatenate([np.eye(3), spread])

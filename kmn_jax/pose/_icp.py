@@ -1,0 +1,233 @@
+"""Iterative closest points: move a nearly right pose onto the scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from kmn_jax.errors import InputError, float_array, is_traced, mask_array, positive_scalar, rigid_pose, row_count
+from kmn_jax.geometry import (
+    compose,
+    from_quaternion_translation,
+    from_rotation_translation,
+    inverse,
+    nearest,
+    transform_points,
+)
+from kmn_jax.pose._kabsch import fit_rigid, rotation_is_determined
+from kmn_jax.pose._result import PoseResult, PoseStatus
+from kmn_jax.typing import ArrayInput, Mask, Normals, Points, Pose, Scalar
+
+_MIN_PAIRS = 6  # equations that fix a pose when each pair gives one
+_DIVERGED = 0.01  # of the squared gate: a cost that grows by less is noise about the optimum
+_DAMPING = 1e-5  # of the mean diagonal: directions that no pair constrains stay where they are
+
+
+@dataclass(frozen=True)
+class IcpConfig:
+    """Set the refinement. Lengths are fractions of the object's diameter."""
+
+    method: Literal["point_to_plane", "point_to_point"] = "point_to_plane"
+    iterations: int = 50
+    distance_gate: float = 0.1  # pairs further apart are left out
+    robust: Literal["none", "cauchy", "tukey"] = "cauchy"  # how pairs lose weight on the way to the gate
+    tolerance: float = 1e-4  # converged when a step is smaller, rotation (radians) plus translation
+
+    def __post_init__(self) -> None:
+        """Refuse values that contradict their meaning."""
+        if self.method not in ("point_to_plane", "point_to_point"):
+            raise ValueError(f"method is {self.method!r}, but must be 'point_to_plane' or 'point_to_point'")
+        if self.robust not in ("none", "cauchy", "tukey"):
+            raise ValueError(f"robust is {self.robust!r}, but must be 'none', 'cauchy' or 'tukey'")
+        if self.iterations < 1:
+            raise ValueError(f"iterations is {self.iterations}, but must be at least 1")
+        if not self.distance_gate > 0:
+            raise ValueError(f"distance_gate is {self.distance_gate}, but must be above zero")
+        if not self.tolerance > 0:
+            raise ValueError(f"tolerance is {self.tolerance}, but must be above zero")
+
+
+class _Pairs(NamedTuple):
+    """Each scene point with its nearest object point, in diameters about the object's initial place."""
+
+    moved: Points  # object point under the present pose
+    object_points: Points  # the same in the object's frame
+    inside: Mask  # within the gate
+    squares: Float[Array, " n"]  # squared distance of the two points
+    cost: Scalar  # mean squared residual over all scene points, cut off at the gate
+
+
+class _State(NamedTuple):
+    step: Int[Array, ""]
+    pose: Pose
+    pairs: _Pairs
+    change: Scalar
+    determined: Bool[Array, ""]
+
+
+def icp(
+    object_points: ArrayInput,
+    scene_points: ArrayInput,
+    T_scene_object: ArrayInput,
+    object_diameter: ArrayInput,
+    scene_normals: ArrayInput | None = None,
+    object_mask: ArrayInput | None = None,
+    scene_mask: ArrayInput | None = None,
+    config: IcpConfig = IcpConfig(),
+) -> PoseResult:
+    """Refine an initial T_scene_object (4, 4) so that object points (m, 3) meet scene points (n, 3).
+
+    Every scene point is paired with its nearest object point, not the other way round, as the object has
+    points that the camera did not see. Point to plane measures along the scene's normals (n, 3), which it needs.
+    Rows where a mask is false are padding. Directions that the geometry leaves open, such as sliding along a
+    single plane, keep their initial value.
+
+    A refinement returns a usable pose even when it fails, other than a search: with `converged` false it is the
+    initial one (status NO_OVERLAP, DEGENERATE or DIVERGED) or the last and better one (ITERATION_LIMIT). A start
+    that is as good as the result is returned itself. Under a trace, an initial pose or diameter that is not
+    finite is INVALID_INPUT, with the identity as the pose. `score` is the share of scene points
+    within the gate.
+
+    Raises InputError for wrong shapes and dtypes, values that are not finite, an initial pose that is not rigid
+    and missing normals.
+    """
+    object_count = row_count(object_points, "object_points")
+    scene_count = row_count(scene_points, "scene_points")
+    object_mask = mask_array(object_mask, "object_mask", object_count)
+    scene_mask = mask_array(scene_mask, "scene_mask", scene_count)
+    object_rows, scene_rows = (None if is_traced(m) else m for m in (object_mask, scene_mask))
+    if config.method == "point_to_plane" and scene_normals is None:
+        raise InputError("scene_normals is missing: point to plane needs it, or choose method='point_to_point'")
+    arrays = [
+        float_array(object_points, "object_points", (None, 3), mask=object_rows),
+        float_array(scene_points, "scene_points", (None, 3), mask=scene_rows),
+        rigid_pose(T_scene_object, "T_scene_object"),
+        positive_scalar(object_diameter, "object_diameter"),
+    ]
+    if object_count == 0 or scene_count == 0:
+        raise InputError(f"{object_count} object points and {scene_count} scene points given: both must be some")
+    if scene_normals is None:
+        scene_normals = jnp.zeros((scene_count, 3), dtype=jnp.float32)
+    arrays.append(float_array(scene_normals, "scene_normals", (scene_count, 3), mask=scene_rows))
+    return _icp(*(array.astype(jnp.float32) for array in arrays), object_mask, scene_mask, config)
+
+
+@partial(jax.jit, static_argnames="config")
+def _icp(
+    object_points: Float[Array, "m 3"],
+    scene_points: Points,
+    T_scene_object: Pose,
+    object_diameter: Scalar,
+    scene_normals: Normals,
+    object_mask: Bool[Array, " m"],
+    scene_mask: Mask,
+    config: IcpConfig,
+) -> PoseResult:
+    valid = jnp.isfinite(T_scene_object).all() & jnp.isfinite(object_diameter) & (object_diameter > 0)
+    initial = jnp.where(valid, T_scene_object, jnp.eye(4, dtype=jnp.float32))
+    unit = jnp.where(valid, object_diameter, 1)
+    object_mask = object_mask & jnp.isfinite(object_points).all(axis=1)
+    scene_mask = scene_mask & jnp.isfinite(scene_points).all(axis=1) & jnp.isfinite(scene_normals).all(axis=1)
+    if config.method == "point_to_plane":  # a point without a normal measures nothing
+        scene_mask = scene_mask & (scene_normals != 0).any(axis=1)
+
+    # Both clouds about the object's centre at its initial pose, in diameters: small numbers, and no unit.
+    object_points = jnp.where(object_mask[:, None], object_points, 0)
+    num_object = jnp.maximum(object_mask.sum(dtype=jnp.int32), 1).astype(jnp.float32)
+    object_centre = object_points.sum(axis=0) / num_object
+    scene_centre = transform_points(initial, object_centre[None, :])[0]
+    model = (object_points - object_centre[None, :]) / unit
+    scene = jnp.where(scene_mask[:, None], (scene_points - scene_centre[None, :]) / unit, 0)
+    normals = jnp.where(scene_mask[:, None], scene_normals, 0)
+    num_scene = jnp.maximum(scene_mask.sum(dtype=jnp.int32), 1).astype(jnp.float32)
+    gate = config.distance_gate
+
+    def residuals(pairs_moved: Points) -> Float[Array, " n"]:
+        difference = pairs_moved - scene
+        if config.method == "point_to_plane":
+            return (normals * difference).sum(axis=1)
+        return jnp.sqrt((difference**2).sum(axis=1))
+
+    def find_pairs(pose: Pose) -> _Pairs:
+        index, distance = nearest(transform_points(inverse(pose), scene), model, object_mask)
+        moved = transform_points(pose, model[index])
+        inside = scene_mask & (distance <= gate)
+        cost = jnp.where(inside, residuals(moved) ** 2, gate**2)
+        return _Pairs(moved, model[index], inside, distance**2, jnp.where(scene_mask, cost, 0).sum() / num_scene)
+
+    def iterate(state: _State) -> _State:
+        moved, object_side, inside, _, _ = state.pairs
+        residual = residuals(moved)
+        weights = jnp.where(inside, _robust_weight(residual / gate, config.robust), 0)
+        if config.method == "point_to_plane":
+            update = _plane_step(moved, normals, residual, weights)
+            pose = compose(update, state.pose)
+            # A single plane leaves sliding open, which the damping holds; a line or a point leaves a turn open.
+            determined = rotation_is_determined(object_side, weights) & rotation_is_determined(scene, weights)
+        else:
+            pose, determined = fit_rigid(object_side, scene, weights), rotation_is_determined(object_side, weights)
+        usable = determined & jnp.isfinite(pose).all() & (inside.sum(dtype=jnp.int32) >= _MIN_PAIRS)
+        pose = jnp.where(usable, pose, state.pose)
+        turned = jnp.sqrt(((pose[:3, :3] - state.pose[:3, :3]) ** 2).sum() / 2)  # the angle, for small ones
+        shifted = jnp.sqrt(((pose[:3, 3] - state.pose[:3, 3]) ** 2).sum())
+        return _State(state.step + 1, pose, find_pairs(pose), turned + shifted, determined)
+
+    def is_moving(state: _State) -> Bool[Array, ""]:
+        return (state.step < config.iterations) & (state.change > config.tolerance)
+
+    start = from_rotation_translation(initial[:3, :3], jnp.zeros(3))
+    first = find_pairs(start)
+    state = jax.lax.while_loop(
+        is_moving, iterate, _State(jnp.int32(0), start, first, jnp.array(jnp.inf), jnp.array(True))
+    )
+
+    conditions = [
+        (~valid, PoseStatus.INVALID_INPUT),
+        (first.inside.sum(dtype=jnp.int32) < _MIN_PAIRS, PoseStatus.NO_OVERLAP),
+        (~state.determined, PoseStatus.DEGENERATE),
+        (state.pairs.cost > first.cost + _DIVERGED * gate**2, PoseStatus.DIVERGED),
+        (state.change > config.tolerance, PoseStatus.ITERATION_LIMIT),
+    ]
+    status = jnp.select([test for test, _ in conditions], [jnp.int32(code) for _, code in conditions], PoseStatus.OK)
+    moved_on = (status == PoseStatus.OK) | (status == PoseStatus.ITERATION_LIMIT)
+    moved_on = moved_on & (state.pairs.cost <= first.cost)
+    pairs = jax.tree.map(lambda new, old: jnp.where(moved_on, new, old), state.pairs, first)
+    rotation = state.pose[:3, :3]
+    shift = unit * state.pose[:3, 3] + scene_centre - (rotation * object_centre[None, :]).sum(axis=1)
+    num_inliers = pairs.inside.sum(dtype=jnp.int32)
+    mean_square = jnp.where(pairs.inside, pairs.squares, 0).sum() / jnp.maximum(num_inliers, 1).astype(jnp.float32)
+    return PoseResult(
+        T_scene_object=jnp.where(moved_on, from_rotation_translation(rotation, shift), initial),
+        score=num_inliers.astype(jnp.float32) / num_scene,
+        num_inliers=num_inliers,
+        rms_error=unit * jnp.sqrt(mean_square),
+        inlier_mask=pairs.inside,
+        converged=status == PoseStatus.OK,
+        status=status,
+    )
+
+
+def _robust_weight(residual: Float[Array, " n"], kind: str) -> Float[Array, " n"]:
+    """Weigh residuals given in gates."""
+    if kind == "tukey":
+        return jnp.maximum(1 - residual**2, 0) ** 2
+    if kind == "cauchy":
+        return 1 / (1 + (residual / 0.25) ** 2)
+    return jnp.ones_like(residual)
+
+
+def _plane_step(moved: Points, normals: Normals, residual: Float[Array, " n"], weights: Float[Array, " n"]) -> Pose:
+    """Return the small motion that brings points onto their planes, by the damped 6x6 normal equations."""
+    jacobian = jnp.concatenate([jnp.cross(moved, normals), normals], axis=1)
+    weighted = weights[:, None] * jacobian
+    system = jnp.matmul(weighted.T, jacobian, precision=jax.lax.Precision.HIGHEST)
+    right = -(weighted * residual[:, None]).sum(axis=0)
+    damping = _DAMPING * jnp.trace(system) / 6
+    solution = jnp.linalg.solve(system + jnp.where(damping > 0, damping, 1) * jnp.eye(6), right)
+    # A quaternion of any length turns by a proper rotation, also when the linear step is not small.
+    return from_quaternion_translation(jnp.concatenate([jnp.ones(1), solution[:3] / 2]), solution[3:])

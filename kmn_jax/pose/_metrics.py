@@ -1,0 +1,185 @@
+"""Pose errors and recall, as the field reports them. All lengths are in the unit of the points.
+
+ADD and ADI: Hinterstoisser et al. 2012; MSSD and discretised symmetries: the BOP challenge's methodology.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from kmn_jax.errors import InputError, float_array, is_traced, mask_array, rigid_pose, row_count
+from kmn_jax.geometry import (
+    compose,
+    from_quaternion_translation,
+    largest_distance,
+    safe_norm,
+    safe_sqrt,
+    squared_distances,
+    transform_points,
+)
+from kmn_jax.typing import ArrayInput, Points, Pose, Scalar
+
+PoseMetric = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
+
+
+def add(T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput) -> jax.Array:
+    """Return the mean distance between object points (m, 3) under two poses, for objects without symmetry."""
+    return _add(*_checked(T_estimated, T_true, points))
+
+
+def adi(T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput) -> jax.Array:
+    """Return the mean distance from each truly posed point to the nearest estimated one, for any object.
+
+    It forgives symmetries, as each point may meet any other.
+    """
+    return _adi(*_checked(T_estimated, T_true, points))
+
+
+def mssd(
+    T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput, symmetries: ArrayInput | None = None
+) -> jax.Array:
+    """Return the largest distance between object points under two poses, at the most favourable symmetry.
+
+    `symmetries` (s, 4, 4) are motions of the object onto itself in its own frame, in the unit of the points
+    (see `discretise_symmetry`); the identity always counts among them.
+    """
+    poses = float_array(
+        np.zeros((0, 4, 4), np.float32) if symmetries is None else symmetries, "symmetries", (None, 4, 4)
+    )
+    return _mssd(*_checked(T_estimated, T_true, points), poses)
+
+
+def discretise_symmetry(axis: ArrayInput, offset: ArrayInput, count: int) -> jax.Array:
+    """Return `count` turns (count, 4, 4) about an axis (3,) of any length through the point `offset` (3,).
+
+    The turns are equally spaced and start with the identity. They stand for a continuous symmetry, or are exactly
+    a discrete one of that order.
+    """
+    axis, offset = float_array(axis, "axis", (3,)), float_array(offset, "offset", (3,))
+    if count < 1:
+        raise InputError(f"count is {count}, but at least one turn is needed")
+    if not is_traced(axis) and not np.any(axis):
+        raise InputError("axis is zero, but must have a direction")
+    return _turns(axis, offset, count)
+
+
+def nearest_instance_error(
+    metric: PoseMetric,
+    T_estimated: ArrayInput,
+    T_true: ArrayInput,
+    points: ArrayInput,
+    mask: ArrayInput | None = None,
+) -> jax.Array:
+    """Return the least error of a pose against several true ones (i, 4, 4), as published results take it.
+
+    `metric` is `add`, `adi` or a function like them. True poses where `mask` (i,) is false are padding; without
+    a single one the error is infinite.
+    """
+    count = row_count(T_true, "T_true")
+    mask = mask_array(mask, "mask", count)
+    truth = float_array(T_true, "T_true", (None, 4, 4), mask=None if is_traced(mask) else mask)
+    if count == 0:
+        return jnp.array(jnp.inf, dtype=jnp.float32)
+    truth = jnp.where(mask[:, None, None], truth, jnp.eye(4, dtype=truth.dtype)[None])
+    estimated, points = rigid_pose(T_estimated, "T_estimated"), _some_points(points)
+    errors = jax.vmap(lambda pose: metric(estimated, pose, points))(truth)
+    return jnp.where(mask, errors, jnp.inf).min()
+
+
+def bounding_box_diagonal(points: ArrayInput) -> jax.Array:
+    """Return the diagonal of the axis-aligned box around points (m, 3): the object's size as published."""
+    points = _some_points(points)
+    return jnp.sqrt(((points.max(axis=0) - points.min(axis=0)) ** 2).sum())
+
+
+def diameter(points: ArrayInput) -> jax.Array:
+    """Return the largest distance between any two points (m, 3): the object's size as BOP takes it.
+
+    Time grows with the square of m: thin clouds of many thousand points first, or take their convex hull.
+    """
+    return _diameter(_some_points(points))
+
+
+def is_correct(error: ArrayInput, size: ArrayInput, threshold: float = 0.1) -> jax.Array:
+    """Tell for each error whether it is below `threshold` times the size; an error that is NaN is not."""
+    return jnp.asarray(error) < threshold * jnp.asarray(size)
+
+
+def recall(errors: ArrayInput, size: ArrayInput, threshold: float = 0.1) -> jax.Array:
+    """Return the share of errors (n,) below `threshold` times the size, one for all () or one each (n,).
+
+    A pose that was not found counts by an infinite error. Raises InputError without a single error.
+    """
+    count = row_count(errors, "errors")
+    if count == 0:
+        raise InputError("errors is empty, but a share needs at least one")
+    errors = float_array(errors, "errors", (count,), finite=False)
+    size = float_array(size, "size", (count,) if np.ndim(size) else ())
+    return is_correct(errors, size, threshold).mean(dtype=jnp.float32)
+
+
+def _checked(T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput) -> tuple[jax.Array, jax.Array, jax.Array]:
+    return (
+        rigid_pose(T_estimated, "T_estimated").astype(jnp.float32),
+        rigid_pose(T_true, "T_true").astype(jnp.float32),
+        _some_points(points),
+    )
+
+
+def _some_points(points: ArrayInput) -> jax.Array:
+    array = float_array(points, "points", (None, 3)).astype(jnp.float32)
+    if array.shape[0] == 0:
+        raise InputError("points is empty, but at least one point is needed")
+    return array
+
+
+def _both(T_estimated: Pose, T_true: Pose, points: Points) -> tuple[Points, Points]:
+    """Return the points under both poses, relative to the centre of the true ones so that digits are not lost."""
+    centre = points.mean(axis=0)
+    points = points - centre[None, :]
+    here = transform_points(T_estimated, centre[None, :]) - transform_points(T_true, centre[None, :])
+    turned = jnp.matmul(points, T_estimated[:3, :3].T, precision=jax.lax.Precision.HIGHEST)
+    return turned + here, jnp.matmul(points, T_true[:3, :3].T, precision=jax.lax.Precision.HIGHEST)
+
+
+@jax.jit
+def _add(T_estimated: Pose, T_true: Pose, points: Points) -> Scalar:
+    estimated, true = _both(T_estimated, T_true, points)
+    return safe_norm(estimated - true).mean()
+
+
+@jax.jit
+def _adi(T_estimated: Pose, T_true: Pose, points: Points) -> Scalar:
+    estimated, true = _both(T_estimated, T_true, points)
+    return safe_sqrt(squared_distances(true, estimated).min(axis=1)).mean()
+
+
+@jax.jit
+def _mssd(T_estimated: Pose, T_true: Pose, points: Points, symmetries: Float[Array, "s 4 4"]) -> Scalar:
+    symmetries = jnp.concatenate([jnp.eye(4, dtype=jnp.float32)[None], symmetries.astype(jnp.float32)])
+
+    def largest(symmetry: Pose) -> Scalar:
+        estimated, true = transform_points(T_estimated, points), transform_points(compose(T_true, symmetry), points)
+        return safe_norm(estimated - true).max()
+
+    return jax.vmap(largest)(symmetries).min()
+
+
+_diameter = jax.jit(largest_distance)
+
+
+def _turns(axis: Float[Array, "3"], offset: Float[Array, "3"], count: int) -> Float[Array, "c 4 4"]:
+    half = jnp.arange(count, dtype=axis.dtype) * (jnp.pi / count)
+    unit = axis / jnp.sqrt((axis**2).sum())
+    quaternions = jnp.concatenate([jnp.cos(half)[:, None], jnp.sin(half)[:, None] * unit[None, :]], axis=1)
+
+    def turn(quaternion: Float[Array, "4"]) -> Pose:
+        about_origin = from_quaternion_translation(quaternion, jnp.zeros(3))
+        return about_origin.at[:3, 3].set(offset - (about_origin[:3, :3] * offset[None, :]).sum(axis=1))
+
+    return jax.vmap(turn)(quaternions)

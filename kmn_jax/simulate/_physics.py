@@ -1,0 +1,337 @@
+"""Copies of an object settle in a bin: rigid-body simulation, and what a scene must satisfy to be used."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from kmn_jax.errors import InputError
+from kmn_jax.simulate._bin_scene import Bin
+from kmn_jax.simulate._hulls import CollisionShape
+
+SIMULATED_DIAGONAL = 0.1  # metres: the parameters below are tuned for objects of this size under earth's gravity
+GRAVITY = 9.81
+WALLS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # outward directions of the bin's four walls
+
+
+@dataclass(frozen=True)
+class BinConfig:
+    """How copies are dropped, simulated and accepted. Lengths are in diagonals of the object, times in seconds.
+
+    Each attempt draws its bin: `length` x `width` times one factor from the range `scale`, of a height from the range
+    `height`. Factors whose bin would overflow, where copies fill the share `packing` of the space, are left out. Small
+    factors pile copies higher: of 20, about 80% touch the floor at 1.0, and 40% at 0.65.
+    """
+
+    length: float = 3.4
+    width: float = 2.4
+    scale: tuple[float, float] = (0.6, 1.05)
+    height: tuple[float, float] = (1.0, 1.4)
+    thickness: float = 0.05
+    packing: float = 0.35
+
+    step: float = 0.002
+    friction: float = 0.5
+    damping: tuple[float, float] = (1.0, 0.5)  # of speed and of rotation, per second
+    check_every: float = 0.1
+    rest_checks: int = 2
+    rest_speed: float = 0.15  # diagonals per second
+    rest_rotation: float = 0.3  # radians per second
+    time_cap: float = 4.0
+
+    penetration: float = 0.003  # the most that an accepted scene shows in a contact, and in walls and floor
+    attempts: int = 8
+
+    def __post_init__(self) -> None:
+        sizes, times = ("length", "width", "thickness"), ("step", "check_every", "time_cap")
+        for name in (*sizes, *times, "friction", "rest_speed", "rest_rotation", "penetration"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"bin config: {name} is {getattr(self, name)}, but must be above zero and finite")
+        for name in ("scale", "height"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high < math.inf:
+                raise InputError(f"bin config: {name} is {(low, high)}, but must be a range above zero")
+        if not 0 <= min(self.damping) <= max(self.damping) < math.inf:
+            raise InputError(f"bin config: damping is {self.damping}, but must be 0 or more, and finite")
+        if not 0 < self.packing <= 1:
+            raise InputError(f"bin config: packing is {self.packing}, but must be above 0 and at most 1")
+        if self.attempts < 1 or self.rest_checks < 1:
+            raise InputError("bin config: attempts and rest_checks must be 1 or more")
+        if self.check_every < self.step:
+            raise InputError("bin config: check_every is shorter than one step")
+
+
+@dataclass(frozen=True)
+class DropResult:
+    """What became of a drop. Poses and bin are in the object's unit, and of the last attempt where none was accepted.
+
+    `penetration` is the deepest contact and `speed` that of the fastest copy, in diagonals (a second); `rotation` is in
+    radians per second. `capped` means not at rest when the time was over. `floor_share` of the copies touch the floor.
+    `rejected` says why each attempt was not used. There are no poses where not even dropping was possible.
+    """
+
+    accepted: bool
+    T_bin_object: Float[np.ndarray, "n 4 4"]
+    bin: Bin
+    penetration: float
+    speed: float
+    rotation: float
+    simulated_time: float
+    capped: bool
+    floor_share: float
+    attempts: int
+    rejected: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """The end of one simulation, in simulated metres."""
+
+    T_bin_body: np.ndarray
+    penetration: float = 0.0
+    speed: float = 0.0
+    rotation: float = 0.0
+    time: float = 0.0
+    capped: bool = False
+    floor_share: float = 0.0
+    above_rim: bool = False
+    in_air: bool = False
+    warnings: str = ""
+
+
+def settle(shape: CollisionShape, copies: int, config: BinConfig, seed: int | Sequence[int]) -> DropResult:
+    """Drop copies of an object into a bin and let them come to rest.
+
+    The same arguments give the same bits on one machine. That nothing could be accepted is told by the result, never by
+    an exception.
+
+    Args:
+        shape: collision shape of the object, see `collision_shape`.
+        copies: how many, 1 or more.
+        seed: one number or several, 0 or more, such as those of the run, of the object and of the drop.
+
+    Raises:
+        InputError: there are no copies, a seed is negative, or the shape has no volume.
+    """
+    if copies < 1:
+        raise InputError(f"copies is {copies}, but a bin needs 1 or more")
+    if np.min(seed, initial=0) < 0:
+        raise InputError(f"seed is {seed}, but must be 0 or more")
+    if not (0 < shape.diagonal < math.inf and 0 < shape.volume < math.inf):
+        raise InputError(
+            f"the collision shape has diagonal {shape.diagonal} and volume {shape.volume}: both must be > 0"
+        )
+    rng = np.random.default_rng(seed)
+    body = _Body(shape)
+    least, most = _bin_scales(shape, copies, config)
+    rejected: list[str] = []
+    accepted = False
+    while not accepted and len(rejected) < config.attempts:
+        scale = rng.uniform(least, most)
+        size = np.array([config.length * scale, config.width * scale, rng.uniform(*config.height)]) * SIMULATED_DIAGONAL
+        spawned = _spawn(body, copies, size, rng)
+        if spawned is None or copies * body.volume > size.prod():
+            rest, faults = _Rest(np.zeros((0, 4, 4))), "the bin is too small for the copies"
+        else:
+            rest = _simulate(body, spawned, size, config)
+            faults = _faults(body, rest, size, config)
+        accepted = not faults
+        if faults:
+            rejected.append(faults)
+            least = min(max(least, 1.1 * scale), most)  # most faults are those of a bin that is too full
+    length, width, height = (float(value) for value in size / body.scale)
+    return DropResult(
+        accepted=accepted,
+        T_bin_object=body.to_object(rest.T_bin_body),
+        bin=Bin(length, width, height, config.thickness * shape.diagonal),
+        penetration=rest.penetration / SIMULATED_DIAGONAL,
+        speed=rest.speed / SIMULATED_DIAGONAL,
+        rotation=rest.rotation,
+        simulated_time=rest.time,
+        capped=rest.capped,
+        floor_share=rest.floor_share,
+        attempts=len(rejected) + accepted,
+        rejected=tuple(rejected),
+    )
+
+
+class _Body:
+    """The shape as it is simulated: diagonal 0.1 m, centre of mass at the origin, principal axes along the axes."""
+
+    def __init__(self, shape: CollisionShape) -> None:
+        self.shape = shape
+        self.scale = SIMULATED_DIAGONAL / shape.diagonal
+        self.parts = [(part - shape.center) @ shape.R_object_principal * self.scale for part in shape.parts]
+        self.corners = np.concatenate(self.parts)
+        self.volume = shape.volume * self.scale**3
+        self.mass = 1000.0 * self.volume
+        self.inertia = shape.inertia * self.scale**2 * self.mass
+
+    def to_object(self, T_bin_body: np.ndarray) -> np.ndarray:
+        """Return the poses of the object itself, in its own unit."""
+        rotation = T_bin_body[:, :3, :3] @ self.shape.R_object_principal.T
+        T_bin_object = np.tile(np.eye(4), (len(T_bin_body), 1, 1))
+        T_bin_object[:, :3, :3] = rotation
+        T_bin_object[:, :3, 3] = T_bin_body[:, :3, 3] / self.scale - rotation @ self.shape.center
+        return T_bin_object
+
+
+def _bin_scales(shape: CollisionShape, copies: int, config: BinConfig) -> tuple[float, float]:
+    """Return the range of scales whose bins hold the copies; the largest scale where none does."""
+    room = config.packing * config.length * config.width * config.height[0] * shape.diagonal**3
+    least = math.sqrt(copies * shape.volume / room)
+    return min(max(config.scale[0], least), config.scale[1]), config.scale[1]
+
+
+def _spawn(body: _Body, copies: int, size: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
+    """Return random poses above the floor, each copy lowered until its box would touch another's; None without room."""
+    from scipy.spatial.transform import Rotation
+
+    gap = 0.02 * SIMULATED_DIAGONAL
+    lows, highs = np.zeros((0, 3)), np.zeros((0, 3))
+    poses = np.tile(np.eye(4), (copies, 1, 1))
+    for pose in poses:
+        for rotation in Rotation.random(20, rng=rng).as_matrix():
+            corners = body.corners @ rotation.T
+            low, high = corners.min(axis=0) - gap, corners.max(axis=0) + gap
+            room = size[:2] - (high - low)[:2]
+            if (room > 0).all():
+                break
+        else:
+            return None
+        places = []
+        for x, y in rng.uniform(size=(4, 2)) * room - size[:2] / 2 - low[:2]:
+            place = np.array([x, y, -low[2]])
+            under = ((lows < high + place) & (highs > low + place))[:, :2].all(axis=1)
+            place[2] += highs[under, 2].max(initial=0.0)
+            places.append(place)
+        place = min(places, key=lambda xyz: xyz[2])
+        pose[:3, :3], pose[:3, 3] = rotation, place
+        lows, highs = np.vstack([lows, low + place]), np.vstack([highs, high + place])
+    return poses
+
+
+def _model(body: _Body, copies: int, size: np.ndarray, config: BinConfig) -> Any:
+    """Return the mujoco model: four walls and a floor as planes, one free body a copy."""
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    spec.option.timestep = config.step
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    spec.option.iterations = 30
+    spec.option.tolerance = 1e-7
+    spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    spec.option.gravity = [0, 0, -GRAVITY]
+    contact: dict[str, Any] = {
+        "condim": 4,
+        "friction": [config.friction, 0.005, 0.0001],
+        "solref": [0.005, 1],
+        "solimp": [0.95, 0.99, 0.0005, 0.5, 2],
+    }
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    spec.worldbody.add_geom(name="floor", type=plane, size=[1, 1, 1], **contact)
+    for number, (x, y) in enumerate(WALLS):
+        position = [x * size[0] / 2, y * size[1] / 2, 0]
+        spec.worldbody.add_geom(
+            name=f"wall{number}", type=plane, size=[1, 1, 1], pos=position, zaxis=[-x, -y, 0], **contact
+        )
+    for number, part in enumerate(body.parts):
+        spec.add_mesh(name=f"part{number}", uservert=part.ravel())
+    for _ in range(copies):
+        added = spec.worldbody.add_body(mass=body.mass, inertia=body.inertia, explicitinertial=True)
+        added.add_freejoint()
+        for number in range(len(body.parts)):
+            added.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"part{number}", mass=0, **contact)
+    model = spec.compile()
+    model.dof_damping[:] = np.tile(
+        np.concatenate([np.full(3, body.mass * config.damping[0]), body.inertia * config.damping[1]]), copies
+    )
+    return model
+
+
+def _simulate(body: _Body, T_bin_body: np.ndarray, size: np.ndarray, config: BinConfig) -> _Rest:
+    """Let the bodies fall until they rest, or the time is over, or mujoco warns."""
+    import mujoco
+    from scipy.spatial.transform import Rotation
+
+    copies = len(T_bin_body)
+    try:
+        model = _model(body, copies, size, config)
+    except ValueError as error:
+        return _Rest(T_bin_body, warnings=f"mujoco refuses the shape: {error}")
+    data = mujoco.MjData(model)
+    quaternions = Rotation.from_matrix(T_bin_body[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+    data.qpos[:] = np.concatenate([T_bin_body[:, :3, 3], quaternions], axis=1).ravel()
+    steps = round(config.check_every / config.step)
+    checks, calm = max(1, round(config.time_cap / config.check_every)), 0
+    for _ in range(checks):
+        with _warnings_unprinted():
+            mujoco.mj_step(model, data, nstep=steps)
+        if data.warning.number.any():
+            break
+        speed, rotation = np.linalg.norm(data.qvel.reshape(copies, 2, 3), axis=2).max(axis=0)
+        still = speed < config.rest_speed * SIMULATED_DIAGONAL and rotation < config.rest_rotation
+        calm = calm + 1 if still else 0
+        if calm == config.rest_checks:
+            break
+    warned = np.flatnonzero(data.warning.number)
+    if warned.size:
+        names = ", ".join(mujoco.mjtWarning(int(kind)).name for kind in warned)
+        return _Rest(T_bin_body, time=float(data.time), warnings=f"the simulation broke down: {names}")
+    mujoco.mj_forward(model, data)  # contacts of the last pose
+    poses = np.tile(np.eye(4), (copies, 1, 1))
+    poses[:, :3, 3] = data.xpos[1:]
+    poses[:, :3, :3] = data.xmat[1:].reshape(copies, 3, 3)
+    geoms = data.contact.geom
+    touching = model.geom_bodyid[geoms]
+    on_floor = touching[(geoms == 0).any(axis=1)]
+    on_wall = ((geoms > 0) & (geoms <= len(WALLS))).any(axis=1)
+    return _Rest(
+        T_bin_body=poses,
+        penetration=max(0.0, -float(data.contact.dist.min(initial=0.0))),
+        speed=float(speed),
+        rotation=float(rotation),
+        time=float(data.time),
+        capped=calm < config.rest_checks,
+        floor_share=len(np.unique(on_floor[on_floor > 0])) / copies,
+        above_rim=bool((data.contact.pos[on_wall, 2] > size[2]).any()),
+        in_air=len(np.unique(touching[touching > 0])) < copies,
+    )
+
+
+@contextmanager
+def _warnings_unprinted() -> Iterator[None]:
+    """Keep mujoco from writing a log file into the working directory; its warnings are counted in the data."""
+    import mujoco
+
+    previous = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(previous)
+
+
+def _faults(body: _Body, rest: _Rest, size: np.ndarray, config: BinConfig) -> str:
+    """Return why a scene cannot be used; empty if it can."""
+    if rest.warnings:
+        return rest.warnings
+    faults = []
+    if rest.penetration > config.penetration * SIMULATED_DIAGONAL:
+        faults.append(f"copies penetrate by {rest.penetration / SIMULATED_DIAGONAL:.2%} of the diagonal")
+    corners = np.einsum("nij,vj->nvi", rest.T_bin_body[:, :3, :3], body.corners) + rest.T_bin_body[:, None, :3, 3]
+    beyond = float(max((np.abs(corners[..., :2]) - size[:2] / 2).max(), -corners[..., 2].min()))
+    if beyond > config.penetration * SIMULATED_DIAGONAL:
+        faults.append(f"a copy reaches {beyond / SIMULATED_DIAGONAL:.2%} of the diagonal into a wall or the floor")
+    if rest.above_rim:
+        faults.append("a copy leans on the wall above the rim")
+    if rest.in_air:
+        faults.append("a copy touches nothing")
+    return ", ".join(faults)

@@ -1,0 +1,382 @@
+"""A training run: a folder, from which it can go on to the bit, and the steps between two stops.
+
+The only module of training that acts: it draws batches, dispatches steps, writes files and listens to signals.
+
+A run's folder holds `config.json`; `sessions.jsonl`, with commit, versions and devices; `metrics.jsonl`, the same as
+`metrics.csv` and for TensorBoard in `events/`; `checkpoints/`; `model.safetensors`, the running mean of the parameters
+at the lowest validation loss, and `last.safetensors`, at the last stop.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+from jaxtyping import Array
+
+from kmn_jax.data import BatchIterator, SampleIndex
+from kmn_jax.errors import InputError
+from kmn_jax.files import write_whole
+from kmn_jax.models import model_structure, save_model
+from kmn_jax.train._checkpoint import Checkpoints
+from kmn_jax.train._config import TrainConfig
+from kmn_jax.train._records import MetricFiles, check_config, check_same, write_config, write_session
+from kmn_jax.train._sharding import (
+    any_process,
+    check_batch,
+    data_mesh,
+    jit_eval_step,
+    jit_train_step,
+    put_batch,
+    put_number,
+    put_whole,
+)
+from kmn_jax.train._snapshot import Snapshot, from_first_process
+from kmn_jax.train._sources import ignore, trained_network, training_source, validation_source
+from kmn_jax.train._step import Metrics, Samples, create_state, index_of, mean_metrics, total_sums
+from kmn_jax.train._stop import StopRequest
+from kmn_jax.train._transfer import FILE_LIMIT, MANIFEST, export_snapshot, import_snapshot
+from kmn_jax.train._window import MEANS, Window
+
+# What a resumed run may change: how long it is, where its pack lies, what it writes when, and the share of examples
+# with random keypoints, as the last steps may be spent on those that the estimator uses.
+_FREE = ("name", "pack", "num_steps", "validate_every", "checkpoint_every", "log_every", "examples.random_keypoints")
+_CARRIED = ("metrics.jsonl", "sessions.jsonl", "model.safetensors")  # go with an export
+_READERS = 4  # threads that read images ahead
+_AHEAD = 2  # steps that are dispatched before the metrics of one are read
+
+
+class NotFiniteError(RuntimeError):
+    """A loss or gradient was not finite. The message is one sentence for people."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Where a run stands: `reason` says why it stopped before its last step, empty if it did not."""
+
+    step: int
+    reason: str
+    best_loss: float | None  # the lowest validation loss
+    best_step: int
+
+
+class _Pending(NamedTuple):
+    number: int
+    samples: SampleIndex
+    batches: bytes  # the state from which the batch was drawn
+    metrics: Metrics
+    stop: Array | bool
+
+
+def train(
+    config: TrainConfig,
+    folder: str | Path,
+    *,
+    max_minutes: float | None = None,
+    resume: bool = False,
+    import_from: str | Path | None = None,
+    export_to: str | Path | None = None,
+    progress: bool = True,
+    report: Callable[[str], None] | None = None,
+) -> Outcome:
+    """Train, from the beginning or with `resume` from the last checkpoint, until done or told to stop.
+
+    SIGTERM, SIGINT and `max_minutes` stop it between two steps, with everything saved. `import_from` begins with an
+    exported snapshot, in a new folder; `export_to` writes one of where the run stopped. Messages go to `report`, by
+    default to stdout, above the progress bar.
+
+    Raises:
+        InputError: a folder with a run and no `resume`, a config that differs from the run's, data that cannot be
+            used, or batches that devices cannot share.
+        NotFiniteError: a loss or gradient was not finite; state and batch are in the run's folder `nan`.
+    """
+    folder = Path(folder)
+    stop = StopRequest(max_minutes)
+    # By one process, or the others might find what it has just written.
+    from_first_process(lambda: _check(folder, config, resume, import_from, export_to))
+    run = _Run(config, folder, data_mesh(), stop, report or _print)
+    run.restore(import_from)
+    with stop:
+        outcome = run.loop(progress)
+    if export_to is not None and run.first:
+        run.export(Path(export_to))
+    return outcome
+
+
+def _check(
+    folder: Path, config: TrainConfig, resume: bool, import_from: str | Path | None, export_to: str | Path | None
+) -> None:
+    """See that the folder holds this run or none, before anything takes time."""
+    exists = any((folder / "checkpoints").glob("*"))  # without one there is nothing to lose
+    if exists and import_from is not None:
+        raise InputError(f"{folder} holds a run already: resume it without importing, or import into another folder")
+    if exists and not resume:
+        raise InputError(f"{folder} holds a run: resume it, or choose another folder")
+    if export_to is not None and (Path(export_to) / MANIFEST).exists():
+        raise InputError(f"{export_to} holds an export already: choose another folder to export to")
+    if exists and (folder / "config.json").exists():
+        check_config(folder, asdict(config), _FREE)
+    if export_to is not None:
+        _make_folder(Path(export_to))
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make the folder {folder}: {error.strerror}") from None
+
+
+class _Run:
+    def __init__(
+        self, config: TrainConfig, folder: Path, mesh: Mesh, stop: StopRequest, report: Callable[[str], None]
+    ) -> None:
+        self.config, self.folder, self.mesh, self.stop = config, folder, mesh, stop
+        self.first = jax.process_index() == 0
+        self.report = report if self.first else ignore
+        size = config.pipeline.batch_size
+        check_batch(size, config.step, mesh)
+        self.training, self.validation = (
+            source(config, mesh, lambda problem: self.report(f"left out: {problem}"))
+            for source in (training_source, validation_source)
+        )
+        self.saved_graphdef = model_structure(trained_network(config)).graphdef
+        optimizer, num_steps = config.optimizer, config.num_steps
+        self.graphdef, state = create_state(config.step, optimizer.build(num_steps))
+        self.state = put_whole(state, mesh)
+        self.train_step = jit_train_step(self.graphdef, optimizer, num_steps, config.step, mesh)
+        self.eval_step = jit_eval_step(self.graphdef, config.step, mesh)
+        self.rates = optimizer.rates(num_steps)
+        read = self.training.read
+        self.batches: BatchIterator[Samples] = BatchIterator(
+            self.training.batches, read, self.training.digest, threads=_READERS if read else 0, ahead=_READERS
+        )
+        self.checkpoints = Checkpoints(folder / "checkpoints", report=self.report)
+        self.pending: deque[_Pending] = deque()
+        self.stopped = ""
+        self.step = self.validated = self.best_step = 0
+        self.saved = -1
+        self.best_loss: float | None = None
+        self.seconds_before, self.began = 0.0, time.monotonic()
+        self.window = Window()
+
+    def restore(self, import_from: str | Path | None) -> None:
+        """Go on from an exported snapshot or the last checkpoint, if there is one."""
+        found = self.checkpoints.latest(self.state) if import_from is None else import_snapshot(import_from, self.state)
+        if found is None:
+            from_first_process(self._check_none)
+        _make_folder(self.folder)
+        if found is not None and import_from is None:
+            check_same(f"{self.folder}", found.facts.get("config", {}), asdict(self.config), _FREE)
+        if found is not None:
+            self._take(found)
+            self.report(f"going on at step {self.step} of {self.config.num_steps}")
+        if import_from is not None:
+            self._save(best=False)  # before there is a config: a run that can be resumed must not begin anew
+        if self.first:
+            for name in _CARRIED if import_from is not None else ():
+                if (Path(import_from or "") / name).exists():
+                    shutil.copyfile(Path(import_from or "") / name, self.folder / name)
+            write_config(self.folder, asdict(self.config))
+            facts = {"training_objects": len(self.training.names), "validation_objects": len(self.validation.names)}
+            write_session(self.folder, self.step, facts)
+
+    def _check_none(self) -> None:
+        """See that a run without a usable checkpoint has none: it would begin anew and replace what can be mended."""
+        if self.checkpoints.steps:
+            steps = ", ".join(map(str, self.checkpoints.steps))
+            raise InputError(
+                f"all checkpoints in {self.checkpoints.folder} are damaged (steps {steps}): put back a copy of one, or"
+                " choose another folder to begin anew"
+            )
+
+    def loop(self, progress: bool) -> Outcome:
+        """Train until done or stopped."""
+        from tqdm import tqdm
+
+        config, size = self.config, self.config.pipeline.batch_size
+        quiet = not (progress and self.first)
+        total, done = config.num_steps * size, self.step * size
+        interval = 1.0 if sys.stderr.isatty() else 30.0
+        with ExitStack() as stack:
+            files = MetricFiles(self.folder, self.step, self.validated) if self.first else None
+            self.files = files and stack.enter_context(files)
+            self.bar = tqdm(total=total, initial=done, unit=" samples", disable=quiet, mininterval=interval)
+            stack.enter_context(self.bar)
+            self.window = Window(self.window.saved())
+            while not self._at_boundary():
+                self._advance()
+        if self.first:
+            save_model((self.saved_graphdef, self.state.average), self.folder / "last.safetensors")
+        return Outcome(self.step, self.stopped, self.best_loss, self.best_step)
+
+    def export(self, folder: Path) -> None:
+        """Write where the run stands into a few files that another folder can import."""
+        paths = export_snapshot(self._snapshot(), folder)
+        for name in _CARRIED:
+            path = self.folder / name
+            if path.exists() and path.stat().st_size < FILE_LIMIT:
+                shutil.copyfile(path, folder / name)
+            elif path.exists():
+                self.report(f"{path} stays behind: it has {path.stat().st_size} bytes")
+        self.report(f"exported step {self.step} to {folder}, {len(paths)} files of state")
+
+    def _at_boundary(self) -> bool:
+        """Validate and save if it is time to, and tell whether the run ends here."""
+        config, step = self.config, self.step
+        last = step >= config.num_steps
+        self.stopped = "" if last else self.stopped or self._reason()
+        validate = step > self.validated and (last or step % config.validate_every == 0) and not self.stopped
+        save = bool(self.stopped) or last or step % config.checkpoint_every == 0
+        if not (validate or save):
+            return False
+        self._settle(0)
+        began = time.monotonic()
+        best = validate and self._validate()
+        self.stopped = "" if last else self.stopped or self._reason()
+        if best or ((save or self.stopped) and step != self.saved):
+            self._save(best)
+        self.window.pause(time.monotonic() - began)
+        return last or bool(self.stopped)
+
+    def _reason(self) -> str:
+        # Several processes stop by their common vote, at the same step.
+        return self.stop.reason if jax.process_count() == 1 else ""
+
+    def _advance(self) -> None:
+        state, samples = self.batches.get_state(), next(self.batches)
+        with jax.transfer_guard("disallow"):
+            number = put_number(self.step, self.mesh)
+            batch = put_batch(samples, self.mesh)
+            self.state, metrics = self.train_step(self.state, self.training.pack, batch, number)
+            vote = any_process(bool(self.stop.reason), self.mesh)
+            for array in jax.tree.leaves(metrics):
+                array.copy_to_host_async()
+        self.pending.append(_Pending(self.step, index_of(samples), state, metrics, vote))
+        self.step += 1
+        self._settle(_AHEAD)
+
+    def _settle(self, ahead: int) -> None:
+        """Read the metrics of all steps but the last ones."""
+        config, size = self.config, self.config.pipeline.batch_size
+        while len(self.pending) > ahead:
+            done = self.pending.popleft()
+            metrics: Metrics = jax.device_get(done.metrics)
+            if not metrics.taken:
+                self._fail(done, metrics)
+            if jax.process_count() > 1 and bool(jax.device_get(done.stop)):
+                self.stopped = self.stop.reason or "another process was told to stop"
+            self.window.add(metrics, size)
+            self.bar.update(size)
+            step = done.number + 1
+            if step % config.log_every and step != config.num_steps:
+                continue
+            means = self.window.means()
+            self._write(step, "train", {**means, "learning_rate": float(self.rates[done.number])})
+            self.bar.set_postfix_str(
+                f"loss {means['loss']:.3f}, segmentation {means['segmentation_accuracy']:.3f}, keypoints"
+                f" {means['keypoint_accuracy']:.3f}, rate {self.rates[done.number]:.1e}",
+                refresh=False,
+            )
+            self.window = Window()
+
+    def _validate(self) -> bool:
+        """Validate the running mean of the parameters; tell whether it is the best. A stop breaks it off."""
+        batches, found = self.validation.batches, []
+        for number in range(len(batches)):
+            if self._reason():
+                return False
+            with jax.transfer_guard("disallow"):
+                batch = put_batch(batches[number], self.mesh)
+                found.append(self.eval_step(self.state.average, self.validation.pack, batch))
+            jax.block_until_ready(found[max(0, number - _AHEAD)])
+        metrics = mean_metrics(total_sums(jax.device_get(found)))
+        means = {name: float(getattr(metrics, name)) for name in MEANS}
+        self._write(self.step, "validation", means)
+        self.validated = self.step
+        best = np.isfinite(means["loss"]) and (self.best_loss is None or means["loss"] < self.best_loss)
+        self.report(
+            f"step {self.step}: validation loss {means['loss']:.4f}, segmentation {means['segmentation_accuracy']:.4f},"
+            f" keypoints {means['keypoint_accuracy']:.4f}{', the best so far' if best else ''}"
+        )
+        if best:
+            self.best_loss, self.best_step = means["loss"], self.step
+        return bool(best)
+
+    def _write(self, step: int, split: str, values: dict[str, float]) -> None:
+        if self.files is not None:
+            seen = step * self.config.pipeline.batch_size
+            self.files.write({"step": step, "samples": seen, "split": split, **values, "seconds": self._seconds()})
+
+    def _seconds(self) -> float:
+        return self.seconds_before + time.monotonic() - self.began
+
+    def _save(self, best: bool) -> None:
+        # The model first: a run that is killed in between validates again, and writes both.
+        if best and self.first:
+            save_model((self.saved_graphdef, self.state.average), self.folder / "model.safetensors")
+        self.checkpoints.save(self._snapshot(), best=best)
+        self.saved = self.step
+
+    def _snapshot(self) -> Snapshot:
+        facts = {
+            "config": asdict(self.config),
+            "step": self.step,
+            "samples": self.step * self.config.pipeline.batch_size,
+            "seconds": self._seconds(),
+            "validated": self.validated,
+            "best_loss": self.best_loss,
+            "best_step": self.best_step,
+            "window": self.window.saved(),
+        }
+        return Snapshot(self.state, self.batches.get_state(), facts)
+
+    def _take(self, found: Snapshot) -> None:
+        facts: dict[str, Any] = found.facts
+        self.batches.set_state(found.batches)
+        self.state = found.state
+        self.step = self.saved = int(facts["step"])
+        self.validated, self.best_step = int(facts["validated"]), int(facts["best_step"])
+        self.best_loss = facts["best_loss"]
+        self.seconds_before, self.began = float(facts["seconds"]), time.monotonic()
+        self.window = Window(facts["window"])
+
+    def _fail(self, done: _Pending, metrics: Metrics) -> None:
+        """Save the state before the step and its batch apart, and raise NotFiniteError."""
+        apart = self.folder / "nan"
+        names = [self.training.names[row] for row in done.samples.object]
+        if self.first:
+            shutil.rmtree(apart, ignore_errors=True)
+        self.step = done.number
+        Checkpoints(apart / "checkpoints").save(Snapshot(self.state, done.batches, self._snapshot().facts))
+        samples = [
+            {"object": name, "drop": int(drop), "key": key.tolist()}
+            for name, drop, key in zip(names, done.samples.drop, done.samples.key, strict=True)
+        ]
+        facts = {"step": done.number, "loss": str(metrics.loss), "gradient_norm": str(metrics.gradient_norm)}
+        content = json.dumps({**facts, "samples": samples}, indent=1).encode()
+        _make_folder(apart)
+        write_whole(apart / f"batch{jax.process_index()}.json", content)
+        some = ", ".join(dict.fromkeys(names[: 4 * self.config.pipeline.crops_per_object]))
+        raise NotFiniteError(
+            f"step {done.number}, with the objects {some}, gave loss {metrics.loss} and gradient norm"
+            f" {metrics.gradient_norm}: the state before it and the batch are in {apart}, the last checkpoint is as it"
+            " was; look for the cause there, or export the run and import it into another folder with other values"
+        )
+
+
+def _print(message: str) -> None:
+    from tqdm import tqdm
+
+    tqdm.write(message)

@@ -1,0 +1,119 @@
+"""The data of a run: training and validation objects, on the devices, and the order of their samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from kmn_jax.data import DevicePack, Pack, PipelineConfig, SampleBatches, SampleIndex, StackedPack, stack_pack
+from kmn_jax.errors import InputError
+from kmn_jax.models import KeyMatchNetConfig
+from kmn_jax.train._config import TrainConfig
+from kmn_jax.train._rendered import rendered_frames
+from kmn_jax.train._sharding import put_whole
+from kmn_jax.train._step import Samples
+
+Report = Callable[[str], None]  # is given one sentence for each object or image that is left out
+
+_VALIDATION_SEED = 0  # of the samples, so that runs of all seeds are validated on the same
+
+
+@dataclass(frozen=True)
+class Source:
+    """Objects and batches of their samples, of which each process has its share."""
+
+    pack: DevicePack
+    names: tuple[str, ...]
+    digest: str
+    batches: SampleBatches
+    read: Callable[[SampleIndex], Samples] | None = None  # makes a batch on the host, if the steps do not
+
+
+def ignore(message: str) -> None:
+    """Report nothing."""
+
+
+def training_source(config: TrainConfig, mesh: Mesh, report: Report = ignore) -> Source:
+    """Return the training objects, or the configured share of them, and their endless samples.
+
+    What is left out goes to `report`, of images also while they are read.
+    """
+    if config.rendered is not None:
+        return _rendered_source(config, config.rendered, mesh, report)
+    pack = Pack(config.pack)
+    names = pack.names("train")
+    count = max(1, round(config.training_share * len(names)))
+    chosen = [names[row * len(names) // count] for row in range(min(count, len(names)))]
+    stacked = stack_pack(pack, chosen if names else "train", _with_bits(config))
+    return _source(config, stacked, config.pipeline, mesh, report, ordered=False)
+
+
+def validation_source(config: TrainConfig, mesh: Mesh, report: Report = ignore) -> Source:
+    """Return the validation objects and their fixed samples, in order, as one pass; see `training_source`."""
+    stacked = stack_pack(Pack(config.pack), "validation", _with_bits(config))
+    pipeline = replace(config.pipeline, samples_per_object=config.validation_samples, seed=_VALIDATION_SEED)
+    return _source(config, stacked, pipeline, mesh, report, ordered=True)
+
+
+def trained_network(config: TrainConfig) -> KeyMatchNetConfig:
+    """Return the network's config as it is saved: one of learned features knows the CAD file of its object.
+
+    Raises InputError if such a network is to be trained with more than one object.
+    """
+    if config.network.object_branch == "cad" or config.rendered is not None:
+        return config.network
+    pack = Pack(config.pack)
+    digests = {pack.load(name, visibility=False).digest for name in pack.names()}
+    if len(digests) != 1:
+        raise InputError(
+            f"the pack {config.pack} holds {len(digests)} objects, but a network with learned features is of one"
+        )
+    return replace(config.network, object_digest=digests.pop())
+
+
+def _check_surfels(config: TrainConfig, stacked: StackedPack) -> None:
+    """See before anything is written that the steps can be compiled."""
+    found, needed = stacked.arrays.points.shape[1], config.network.num_object_points
+    if found < needed:
+        raise InputError(
+            f"the pack {config.pack} has {found} surfels an object, but network.num_object_points = {needed}: choose"
+            " fewer, or build a pack with more"
+        )
+
+
+def _with_bits(config: TrainConfig) -> bool:
+    return config.examples.visibility == "bits"
+
+
+def _source(
+    config: TrainConfig,
+    stacked: StackedPack,
+    pipeline: PipelineConfig,
+    mesh: Mesh,
+    report: Report,
+    ordered: bool,
+) -> Source:
+    _check_surfels(config, stacked)
+    for problem in stacked.problems:
+        report(problem)
+    batches = SampleBatches(
+        pipeline,
+        len(stacked.names),
+        np.asarray(stacked.arrays.num_drops),
+        shard_index=jax.process_index(),
+        shard_count=jax.process_count(),
+        ordered=ordered,
+    )
+    return Source(put_whole(stacked.arrays, mesh), stacked.names, stacked.digest, batches)
+
+
+def _rendered_source(config: TrainConfig, folder: str, mesh: Mesh, report: Report) -> Source:
+    frames = rendered_frames(folder, config.rendered_split, config.network, config.examples.crops, report)
+    batches = SampleBatches(
+        config.pipeline, frames.num_frames, 1, shard_index=jax.process_index(), shard_count=jax.process_count()
+    )
+    return Source(put_whole(frames.pack, mesh), frames.names, frames.digest, batches, frames.read)

@@ -1,0 +1,210 @@
+"""What a page shows in space: the scan, and for every pose the part, a label, and the points of its crop.
+
+It is shown in a frame of its own: the sensor's directions (x right, y down, z forward), the scan's centre as origin and
+the scan's size as unit of length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8, UInt32
+
+from kmn_jax.detection import Detection, View, into, placed
+from kmn_jax.objects import Part
+from kmn_jax.viz._legend import LIKELY, NOT_THE_PART, center_of
+from kmn_jax.viz._picture import RELIEF
+from kmn_jax.viz._raster import as_bytes, depth_colors, distinct_colors, image_places, relief_of, surface_discs
+
+_FIELD_OF_VIEW = np.radians(40)
+_MOST_SCAN_POINTS = 300_000  # that are sent
+_MOST_DISCS = 60_000  # of all poses' surfaces
+_REACH = np.radians(1.5)  # from a click, in which the nearest point of the scan has to be
+_SAME_RAY = np.radians(0.3)  # points so near to the clicked ray hide each other
+# Of the diameter: so much nearer to the sensor are surfaces and points of crops drawn, to be seen before the scan.
+_SURFACE_LIFT, _CROP_LIFT = 0.006, 0.012
+_PALE = 0.6  # share of white in the colours of unlikely poses
+
+
+@dataclass(frozen=True)
+class PoseNodes:
+    """Viser's handles of a pose: a node that holds its frame, and by layer what is below it."""
+
+    frame: Any
+    layers: dict[str, Any]
+
+
+class PageScene:
+    """The scan and the poses on the page of a viser server."""
+
+    def __init__(self, server: Any, view: View, part: Part) -> None:
+        """Add the scan, and set the camera on the sensor's side, as near as the scan fills the page."""
+        self._scene, self._view, self._part = server.scene, view, part
+        self._T_view_scene = np.linalg.inv(view.T_scene_view)
+        low, high = np.percentile(view.points, [1, 99], axis=0).astype(np.float64)
+        self._center = (low + high) / 2
+        self._size = max(float(np.linalg.norm(high - low)), 0.5 * part.diameter)
+        self._points = self._on_page(view.points).astype(np.float32)
+        self._scene.set_up_direction("-y")
+        towards = -_unit(self._center)
+        width, height, depth = (high - low) / self._size
+        distance = depth / 2 + 0.55 * max(height, width / 1.3) / np.tan(_FIELD_OF_VIEW / 2)
+        server.initial_camera.position = towards * max(distance, 0.1)
+        server.initial_camera.look_at = np.zeros(3)
+        server.initial_camera.fov = _FIELD_OF_VIEW
+        self._add_lights()
+        rows = np.arange(len(view.points))
+        if len(rows) > _MOST_SCAN_POINTS:
+            rows = np.random.default_rng(0).choice(rows, _MOST_SCAN_POINTS, replace=False)
+        shade = self._shade(view.points[rows])[:, None]
+        self._dot = 1.3 * _spacing(self._points[rows])
+        self._grey = as_bytes(np.repeat(0.25 + 0.6 * shade, 3, axis=1))
+        self._by_depth = as_bytes(depth_colors(view.points[rows, 2]) * (0.4 + 0.6 * shade))
+        self._scan = self._add_points("/scan", self._points[rows], self._grey)
+
+    def show_scan(self, shown: bool, by_depth: bool) -> None:
+        """Show or hide the scan, in the colours of depth or in grey."""
+        self._scan.visible = shown
+        self._scan.colors = self._by_depth if by_depth else self._grey
+
+    def add_pose(self, rank: int, pose: Detection, color: Float[np.ndarray, "3"], count: int) -> PoseNodes:
+        """Add one of `count` poses; its layers are Surfaces, Labels, Segmentation and Keypoints."""
+        from viser.transforms import SO3
+
+        scene, part, name = self._scene, self._part, f"/poses/{rank}"
+        T = self._T_view_scene @ pose.T_scene_object
+        frame = scene.add_frame(
+            name,
+            show_axes=False,
+            axes_length=0.5 * part.diameter / self._size,
+            axes_radius=0.012 * part.diameter / self._size,
+            wxyz=SO3.from_matrix(T[:3, :3]).wxyz,
+            position=self._on_page(T[None, :3, 3])[0],
+        )
+        likely = pose.probability >= LIKELY
+        most = int(np.clip(_MOST_DISCS // count, 400, 3000))
+        vertices, faces = _hexagons(*surface_discs(part.points, part.normals, most))
+        surface = scene.add_mesh_simple(
+            f"{name}/surface",
+            (vertices / self._size).astype(np.float32),
+            faces,
+            color=tuple(int(value) for value in as_bytes(color if likely else _PALE + (1 - _PALE) * color)),
+            position=-_SURFACE_LIFT * part.diameter / self._size * _unit(T[:3, 3]) @ T[:3, :3],
+            side="double",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        label = scene.add_label(
+            f"{name}/label",
+            f"{rank}: {pose.probability:.2f}",
+            position=center_of(part) / self._size,
+            anchor="center-center",
+        )
+        prediction = pose.prediction
+        on = prediction.on_object
+        seen = placed(self._T_view_scene, prediction.points.astype(np.float64))
+        seen -= _CROP_LIFT * part.diameter * _unit(seen)
+        points = into(T, seen) / self._size
+        colors = np.where(on[:, None], color, NOT_THE_PART)
+        keypoints = distinct_colors(part.num_keypoints)[prediction.keypoint[on]]
+        return PoseNodes(
+            frame,
+            {
+                "Surfaces": surface,
+                "Labels": label,
+                "Segmentation": self._add_points(f"{name}/segmentation", points, as_bytes(colors)),
+                "Keypoints": self._add_points(f"{name}/keypoints", points[on], as_bytes(keypoints)),
+            },
+        )
+
+    def picked(
+        self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "3"] | None:
+        """Return the point of the scan that a ray of the page meets, in the scene's frame; None if it meets none."""
+        row = nearest_to_ray(self._points, origin, direction)
+        if row is None:
+            return None
+        return placed(self._view.T_scene_view, self._view.points[row].astype(np.float64)[None])[0]
+
+    def mark(self, point: Float[np.ndarray, "3"]) -> Any:
+        """Mark a point of the scene's frame; return the node."""
+        place = self._on_page(placed(self._T_view_scene, point[None]))[0]
+        radius = 0.04 * self._part.diameter / self._size
+        return self._scene.add_icosphere("/picked", radius=radius, color=(230, 0, 120), position=place)
+
+    def _add_lights(self) -> None:
+        """Light the scene from the sensor's side; the light of a room, which viser has, takes long without a GPU."""
+        self._scene.configure_environment_map(None)
+        self._scene.configure_default_lights(False)
+        self._scene.add_light_ambient("/lights/ambient", intensity=1.2)
+        for name, position, intensity in (("front", (-0.4, -0.5, -0.8), 2.4), ("back", (0.4, 0.5, 0.8), 1.0)):
+            self._scene.add_light_directional(f"/lights/{name}", position=position, intensity=intensity)
+
+    def _shade(self, points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Return how bright points of the scan are: as the depth image is where it has them."""
+        step, depth, shades = relief_of(self._view.depth, self._view.camera, RELIEF * self._part.diameter)
+        column, row = np.round(image_places(self._view.camera, points) / step).astype(int).T
+        shade = shades[row.clip(0, depth.shape[0] - 1), column.clip(0, depth.shape[1] - 1)]
+        return np.where(np.isnan(shade), 0.7, shade).astype(np.float64)
+
+    def _add_points(self, name: str, places: Float[np.ndarray, "n 3"], colors: UInt8[np.ndarray, "n 3"]) -> Any:
+        return self._scene.add_point_cloud(
+            name,
+            places.astype(np.float32),
+            colors,
+            point_size=self._dot,
+            point_shape="circle",
+            point_shading="flat",
+            precision="float32",
+        )
+
+    def _on_page(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return points of the view's frame in the page's."""
+        return (points - self._center) / self._size
+
+
+def nearest_to_ray(
+    points: Float[np.ndarray, "n 3"], origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
+) -> int | None:
+    """Return the row of the point that a ray meets first, None if it passes all at more than 1.5 degrees."""
+    offsets = points - origin
+    along = offsets @ (direction / np.linalg.norm(direction))
+    aside = np.sqrt(np.maximum((offsets**2).sum(axis=1) - along**2, 0))
+    angles = np.where(along > 0, np.arctan2(aside, along), np.inf)
+    nearest = float(angles.min())
+    if nearest > _REACH:
+        return None
+    return int(np.where(angles <= nearest + _SAME_RAY, along, np.inf).argmin())
+
+
+def _unit(vectors: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s 3"]:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
+def _spacing(points: Float[np.ndarray, "n 3"]) -> float:
+    """Return how far points typically are from their nearest ones."""
+    from scipy.spatial import cKDTree
+
+    if len(points) < 2:
+        return 0.01
+    chosen = np.random.default_rng(0).permutation(len(points))[:2000]
+    apart = cKDTree(points).query(points[chosen], k=2)[0][:, 1]
+    return float(np.clip(np.percentile(apart, 75), 5e-4, 0.05))
+
+
+def _hexagons(
+    centers: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, " n"]
+) -> tuple[Float32[np.ndarray, "v 3"], UInt32[np.ndarray, "f 3"]]:
+    """Return the triangles of hexagons in place of discs, wound about their normals."""
+    helper = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
+    first = np.cross(normals, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(normals, first)
+    turns = np.radians(np.arange(0, 360, 60))
+    rims = np.cos(turns)[:, None] * first[:, None] + np.sin(turns)[:, None] * second[:, None]
+    vertices = (centers[:, None] + 1.1 * radii[:, None, None] * rims).reshape(-1, 3)
+    fan = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+    faces = (6 * np.arange(len(centers))[:, None, None] + fan).reshape(-1, 3)
+    return vertices.astype(np.float32), faces.astype(np.uint32)

@@ -1,0 +1,113 @@
+"""A bin in one call: the released network on a committed bin, no transfer on the way, and images of nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import experiments
+from kmn_jax.bop import bop_scan
+from kmn_jax.detection import BinPosesConfig, PoseEstimator, Sight, bin_part, bin_poses
+from kmn_jax.detection._bin_poses import BinPart, BinPoses
+from kmn_jax.errors import InputError
+from kmn_jax.geometry import intrinsics
+from kmn_jax.objects import Part
+from kmn_jax.pose import adi
+
+ASSETS = Path(experiments.__file__).parent / "assets"
+IMAGE = max((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))
+CONFIG = BinPosesConfig(num_seeds=32)
+FLOOR_MARGIN = 3.0  # mm
+
+
+@pytest.fixture(scope="module")
+def estimator() -> PoseEstimator:
+    return PoseEstimator.from_pretrained()
+
+
+@pytest.fixture(scope="module")
+def motor(estimator: PoseEstimator) -> Part:
+    return estimator.prepare(ASSETS / "industrial" / "gear_motor.stl").in_unit("mm")
+
+
+@pytest.fixture(scope="module")
+def on_device(estimator: PoseEstimator, motor: Part) -> BinPart:
+    return bin_part(estimator.model, motor, estimator.probabilities.found, CONFIG)
+
+
+@pytest.fixture(scope="module")
+def seen() -> tuple[Sight, jax.Array, np.ndarray]:
+    """The image, which of its pixels are above the floor, and the true poses."""
+    scan, instances = bop_scan(IMAGE)
+    assert instances is not None
+    assert scan.depth is not None
+    assert scan.camera is not None
+    floor = np.median(scan.depth[scan.depth > 0])
+    above = (scan.depth > 0) & (scan.depth < floor - FLOOR_MARGIN)
+    truth = np.array([one.T_camera_object for one in instances], dtype=np.float32)
+    return Sight(jnp.asarray(scan.depth), intrinsics(scan.camera)), jnp.asarray(above), truth
+
+
+def solve(
+    estimator: PoseEstimator, part: BinPart, sight: Sight, foreground: jax.Array, key: jax.Array | None = None
+) -> BinPoses:
+    model = estimator.model
+    key = jax.random.key(0) if key is None else key
+    count = model.config.num_scene_points
+    return bin_poses(*model, part, sight, foreground, key, num_points=count, config=CONFIG)
+
+
+def test_copies_are_found_from_the_likeliest_on(
+    estimator: PoseEstimator, on_device: BinPart, motor: Part, seen: tuple[Sight, jax.Array, np.ndarray]
+) -> None:
+    sight, above, truth = seen
+    found = jax.device_get(solve(estimator, on_device, sight, above))
+    likely = found.mask & (found.probability >= 0.5)
+    points = motor.points[:500]
+    errors = np.array([[float(adi(pose, one, points)) for one in truth] for pose in found.T_camera_object[likely]])
+    right = errors.min(axis=1) < 0.1 * motor.diameter
+    assert right.sum() >= 3
+    assert right.mean() >= 0.7
+    copies = errors[right].argmin(axis=1)
+    assert len(set(copies.tolist())) == len(copies), "one pose for each copy"
+    assert (np.diff(found.probability) <= 0).all()
+    assert not found.mask[found.mask.sum() :].any(), "what there is comes first"
+    np.testing.assert_array_equal(found.T_camera_object[~found.mask], np.eye(4)[None].repeat((~found.mask).sum(), 0))
+    assert found.overflow == (np.count_nonzero(np.asarray(sight.depth)) > CONFIG.max_points)
+
+
+def test_nothing_goes_through_the_host_and_bits_are_the_same(
+    estimator: PoseEstimator, on_device: BinPart, seen: tuple[Sight, jax.Array, np.ndarray]
+) -> None:
+    sight, above, _ = seen
+    key = jax.random.key(1)
+    first = solve(estimator, on_device, sight, above, key)
+    with jax.transfer_guard("disallow"):
+        again = jax.block_until_ready(solve(estimator, on_device, sight, above, key))
+    jax.tree.map(np.testing.assert_array_equal, first, again)
+
+
+@pytest.mark.parametrize("empty", ["depth", "foreground"])
+def test_an_image_of_nothing_has_no_poses(
+    estimator: PoseEstimator, on_device: BinPart, seen: tuple[Sight, jax.Array, np.ndarray], empty: str
+) -> None:
+    sight, above, _ = seen
+    if empty == "depth":
+        sight = sight._replace(depth=jnp.zeros_like(sight.depth))
+    else:
+        above = jnp.zeros_like(above)
+    found = solve(estimator, on_device, sight, above)
+    assert not found.mask.any()
+    assert not found.probability.any()
+    np.testing.assert_array_equal(found.T_camera_object, np.eye(4)[None].repeat(CONFIG.num_seeds, 0))
+    assert found.overflow == (empty != "depth" and np.count_nonzero(np.asarray(sight.depth)) > CONFIG.max_points)
+
+
+@pytest.mark.parametrize("values", [{"num_seeds": 0}, {"num_seeds": 64, "max_points": 32}])
+def test_settings_without_meaning_are_refused(values: dict[str, int]) -> None:
+    with pytest.raises(InputError, match="num_seeds"):
+        BinPosesConfig(**values)  # type: ignore[arg-type]

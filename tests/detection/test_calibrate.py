@@ -1,0 +1,86 @@
+"""Probabilities: what is fitted is found again, files come back, and what cannot be used is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kmn_jax.detection import (
+    Calibration,
+    Probabilities,
+    expected_calibration_error,
+    fit_calibration,
+    load_probabilities,
+    probabilities_bytes,
+    reliability,
+)
+from kmn_jax.errors import InputError
+
+NAMES = ("first", "second", "constant")
+
+
+def drawn(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return evidence, and outcomes of a known logistic model of it."""
+    rng = np.random.default_rng(0)
+    evidence = np.concatenate([rng.normal(size=(count, 2)) * [1, 5] + [0, 3], np.ones((count, 1))], axis=1)
+    probability = 1 / (1 + np.exp(-(2 * evidence[:, 0] - 0.3 * evidence[:, 1] + 1)))
+    return evidence.astype(np.float32), rng.random(count) < probability
+
+
+def test_a_known_model_is_found_and_its_probabilities_hold() -> None:
+    evidence, right = drawn(20_000)
+    fitted = fit_calibration(evidence, right, NAMES)
+    np.testing.assert_allclose(fitted.weights[:2], [2, -0.3], rtol=0.1)
+    np.testing.assert_allclose(fitted.bias + fitted.weights[2], 1, atol=0.15)
+    assert expected_calibration_error(fitted.probability(evidence), right) < 0.02
+    assert expected_calibration_error(np.full(len(right), 0.99), right) > 0.2
+
+
+def test_a_weight_counts_a_pose_several_times() -> None:
+    evidence, right = drawn(500)
+    twice = np.concatenate([evidence, evidence[:100]]), np.concatenate([right, right[:100]])
+    weights = np.where(np.arange(500) < 100, 2.0, 1.0)
+    # Columns are scaled by the spread of what is given, so the ridge differs a little.
+    weighted, repeated = fit_calibration(evidence, right, NAMES, weights), fit_calibration(*twice, NAMES)
+    np.testing.assert_allclose(weighted.probability(evidence), repeated.probability(evidence), atol=0.01)
+
+
+def test_a_column_speaks_only_the_way_it_may() -> None:
+    evidence, right = drawn(2_000)
+    free = fit_calibration(evidence, right, NAMES)
+    allowed = fit_calibration(evidence, right, NAMES, signs={"first": 1, "second": -1})
+    np.testing.assert_allclose(allowed.probability(evidence), free.probability(evidence), atol=1e-4)
+    forbidden = fit_calibration(evidence, right, NAMES, signs={"first": -1, "second": -1})
+    assert forbidden.weights[0] == 0
+    assert forbidden.weights[1] < 0
+
+
+def test_evidence_that_decides_completely_keeps_finite_weights() -> None:
+    evidence = np.array([[0.0], [0.1], [0.9], [1.0]], dtype=np.float32)
+    fitted = fit_calibration(evidence, np.array([False, False, True, True]), ("only",))
+    assert np.isfinite(fitted.weights).all()
+    assert (fitted.probability(evidence) > 0.5).tolist() == [False, False, True, True]
+    with pytest.raises(InputError, match="4 of 4 poses are right"):
+        fit_calibration(evidence, np.ones(4, dtype=bool), ("only",))
+
+
+def test_reliability_counts_every_pose_once() -> None:
+    probability = np.array([0.0, 0.05, 0.55, 1.0])
+    rows = reliability(probability, np.array([False, False, True, True]))
+    assert [count for _, _, count in rows] == [2, 1, 1]
+    np.testing.assert_allclose([mean for mean, _, _ in rows], [0.025, 0.55, 1.0])
+
+
+def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.calibration.json"
+    fitted = Probabilities(Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25), Calibration(NAMES, (0.0, 1.0, 2.0), -3.0))
+    path.write_bytes(probabilities_bytes(fitted))
+    assert load_probabilities(path, NAMES) == fitted
+    with pytest.raises(InputError, match="of other evidence"):
+        load_probabilities(path, ("first",))
+    for content in ("", "[]", "{}", '{"found": 1, "refined": {"names": ["first"], "weights": ["x"], "bias": 0}}'):
+        path.write_text(content)
+        with pytest.raises(InputError, match="not a readable calibration"):
+            load_probabilities(path, ("first",))

@@ -1,0 +1,242 @@
+"""The estimator as a program uses it: committed bins by the released model, single crops, several parts, bad input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kmn_jax.bop import bop_scan
+from kmn_jax.detection import (
+    EVIDENCE,
+    DetectConfig,
+    ForegroundOptions,
+    PoseEstimator,
+    Seeds,
+    as_json,
+    export_estimator,
+    find_candidates,
+    seeds_over,
+    symmetry_transforms,
+    table,
+)
+from kmn_jax.detection._detect import canonical_pose
+from kmn_jax.errors import InputError
+from kmn_jax.io import Scan
+from kmn_jax.objects import Part, save_part
+from kmn_jax.pose import adi, mssd
+from tests.reference.meshes import Mesh, box, random_rotations
+from tests.reference.meshes import pose as placed
+from tests.reference.solids import revolution
+
+ASSETS = Path(__file__).parent.parent.parent / "experiments" / "assets"
+IMAGES = sorted((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))
+MOTOR = ASSETS / "industrial" / "gear_motor.stl"
+
+
+@pytest.fixture(scope="module")
+def estimator() -> PoseEstimator:
+    return PoseEstimator.from_pretrained()
+
+
+@pytest.fixture(scope="module")
+def motor(estimator: PoseEstimator) -> Part:
+    return estimator.prepare(MOTOR)
+
+
+def bin_of(row: int) -> tuple[Scan, np.ndarray]:
+    scan, instances = bop_scan(IMAGES[row])
+    assert instances is not None
+    return scan, np.array([one.T_camera_object for one in instances], dtype=np.float32)
+
+
+def errors(pose: np.ndarray, truth: np.ndarray, part: Part) -> np.ndarray:
+    points = part.points[:500]
+    return np.array([float(adi(pose.astype(np.float32), one, points)) for one in truth]) / part.diameter
+
+
+def test_a_bin_is_found_and_the_same_inputs_give_the_same_bits(estimator: PoseEstimator, motor: Part) -> None:
+    scan, truth = bin_of(-1)
+    found = estimator.detect(motor, scan)
+    likely = [pose for pose in found.poses if pose.probability >= 0.5]
+    right = [errors(pose.T_scene_object, truth, motor).min() < 0.1 for pose in likely]
+    print(f"copies {len(truth)}, found {len(likely)}, right {sum(right)}, {found.timing}")
+    assert len(likely) >= 3
+    assert np.mean(right) >= 0.9
+    nearest = [int(errors(pose.T_scene_object, truth, motor).argmin()) for pose in likely]
+    assert len(set(nearest)) == len(nearest), "a copy is found once"
+    order = [pose.probability * pose.visible_fraction for pose in found.poses]
+    assert order == sorted(order, reverse=True)
+    for pose in found.poses:
+        assert sum((pose.explained, pose.violated, pose.occluded, pose.unknown)) == pytest.approx(1, abs=1e-3)
+        np.testing.assert_allclose(pose.T_scene_object[:3, :3] @ pose.T_scene_object[:3, :3].T, np.eye(3), atol=1e-12)
+        assert len(pose.prediction.points) == len(pose.prediction.on_object) == len(pose.prediction.keypoint)
+    again = estimator.detect(motor, scan)
+    assert len(again.poses) == len(found.poses)
+    for one, other in zip(found.poses, again.poses, strict=True):
+        np.testing.assert_array_equal(one.T_scene_object, other.T_scene_object)
+        assert one.probability == other.probability
+    top = estimator.detect(motor, scan, top=2)
+    assert [pose.probability for pose in top.poses] == [pose.probability for pose in found.poses[:2]]
+    assert "found" in table(found, 0.5)
+    written = as_json(found, "motor.stl", "bin.png", {"seed": 0})
+    assert written["version"] == 1
+    assert len(written["poses"]) == len(found.poses)
+    assert written["timing"]["total_s"] == pytest.approx(found.timing.total)
+
+
+def test_units_frames_and_sensors_do_not_matter(estimator: PoseEstimator, motor: Part) -> None:
+    scan, truth = bin_of(0)
+    in_metres = estimator.detect(motor, scan.in_unit("m"))
+    assert in_metres.unit == "m"
+    best = max(in_metres.poses, key=lambda pose: pose.probability)
+    shown = best.T_scene_object.copy()
+    shown[:3, 3] *= 1000
+    assert errors(shown, truth, motor).min() < 0.1
+    # The same points in a frame whose origin is not the sensor.
+    T_world_camera = np.array([[0, -1, 0, 300.0], [-1, 0, 0, 50.0], [0, 0, -1, 900.0], [0, 0, 0, 1]])
+    points = (scan.points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]).astype(np.float32)
+    found = estimator.detect(motor, points, unit="mm", sensor=T_world_camera[:3, 3])
+    best = max(found.poses, key=lambda pose: pose.probability)
+    assert errors(np.linalg.inv(T_world_camera) @ best.T_scene_object, truth, motor).min() < 0.1
+
+
+def test_places_and_crops_give_the_pose_there(estimator: PoseEstimator, motor: Part) -> None:
+    scan, truth = bin_of(0)
+    whole = estimator.detect(motor, scan)
+    seed = max(whole.poses, key=lambda pose: pose.probability).seed
+    there = estimator.detect(motor, scan, at=seed, top=1)
+    assert errors(there.poses[0].T_scene_object, truth, motor).min() < 0.1
+    near = np.linalg.norm(scan.points - seed, axis=1) < motor.diameter
+    crop = np.concatenate([seed[None], scan.points[near]]).astype(np.float32)
+    single = estimator.estimate(motor, crop)
+    several = estimator.estimate(motor, [crop, crop[:400]])
+    assert len(several) == 2
+    assert errors(single.poses[0].T_scene_object, truth, motor).min() < 0.1
+    np.testing.assert_array_equal(several[0].poses[0].T_scene_object, single.poses[0].T_scene_object)
+
+
+def test_parts_of_one_size_share_the_features_of_a_scene(estimator: PoseEstimator, motor: Part) -> None:
+    scan, _ = bin_of(0)
+    scene = estimator.scene(scan, motor)
+    twin = replace(motor, name="twin", diameter=motor.diameter * 1.0001)
+    first, second = estimator.detect([motor, twin], scene)
+    assert (first.part, second.part) == ("gear_motor", "twin")
+    length = {name[3] for name in scene.features}
+    assert len(length) == 1
+    assert abs(len(first.poses) - len(second.poses)) <= 2
+
+
+def test_seeds_are_spread_and_the_others_not_searched(estimator: PoseEstimator, motor: Part) -> None:
+    scan, truth = bin_of(0)
+    scene = estimator.scene(scan, motor)
+    config = DetectConfig().candidates
+    seeds = seeds_over(scene, scene.foreground, motor, config)
+    few = Seeds(seeds.rows, seeds.real & (jnp.arange(len(seeds.real)) < 16))
+    found = find_candidates(estimator.model, motor, scene, few, 0, config)
+    assert found.evidence.shape == (16 * config.search.num_modes, len(EVIDENCE))
+    assert np.isfinite(found.evidence).all()
+    right = [errors(pose, truth, motor).min() < 0.1 for pose in found.T_view_object[found.usable]]
+    assert np.mean(right) > 0.3
+
+
+@pytest.mark.parametrize("mesh", [box(40, 20, 10), revolution([(0, 0), (8, 0), (8, 30), (0, 30)])])
+def test_a_symmetric_part_has_one_canonical_pose(estimator: PoseEstimator, mesh: Mesh) -> None:
+    part = estimator.prepare(mesh)
+    assert part.is_symmetric
+    base = placed((10, 20, 500), random_rotations(1, 3)[0])
+    chosen = canonical_pose(base, part.symmetries)
+    transforms = symmetry_transforms(part.symmetries).astype(float)
+    for transform in transforms[:: max(1, len(transforms) // 6)]:
+        np.testing.assert_allclose(canonical_pose(base @ transform, part.symmetries), chosen, atol=1e-3)
+    off = float(mssd(chosen.astype("f4"), base.astype("f4"), part.points[:300], transforms.astype("f4")))
+    assert off < 0.06 * part.diameter
+    assert np.linalg.det(chosen[:3, :3]) == pytest.approx(1)
+    assert np.trace(chosen[:3, :3]) >= np.trace(base[:3, :3]) - 1e-9
+
+
+def test_what_cannot_be_is_one_sentence(estimator: PoseEstimator, motor: Part, tmp_path: Path) -> None:
+    scan, _ = bin_of(0)
+    with pytest.raises(InputError, match=r"say --units|metres"):
+        estimator.detect(motor, scan.points, unit="m")
+    with pytest.raises(InputError, match="region of interest"):
+        estimator.detect(motor, scan, background=ForegroundOptions(roi=(1e6, 1e6, 1e6, 2e6, 2e6, 2e6)))
+    with pytest.raises(InputError, match="prepared with other weights"):
+        estimator.detect(replace(motor, model_digest="0"), scan)
+    with pytest.raises(InputError, match="none of the scan's 5 points was measured"):
+        estimator.detect(motor, np.full((5, 3), np.nan, np.float32))
+    with pytest.raises(InputError, match="cannot be made of a dict"):
+        estimator.prepare({})
+    with pytest.raises(InputError, match="must be \\(n, 3\\)"):
+        estimator.prepare(np.zeros((5, 2)))
+    with pytest.raises(InputError, match="seed is -1, but must be between 0"):
+        estimator.detect(motor, scan, seed=-1)
+    with pytest.raises(InputError, match=r"place 2 to search at is .* mm away from the nearest measured point"):
+        estimator.detect(motor, scan, at=np.stack([scan.points[0], [9000.0, 0, 0]]))
+    with pytest.raises(InputError, match="leave the sensor's place out"):
+        estimator.detect(motor, scan, sensor=np.zeros(3))
+    save_part(motor, tmp_path / "motor.kmn")
+    assert estimator.prepare(tmp_path / "motor.kmn", "mm").unit == "mm"
+    with pytest.raises(InputError, match="says that its lengths are mm, not m: make the card again"):
+        estimator.prepare(tmp_path / "motor.kmn", "m")
+    with pytest.raises(InputError, match="there is no released model"):
+        PoseEstimator.from_pretrained("none")
+
+
+def test_a_scan_without_the_part_is_an_empty_or_doubtful_result(estimator: PoseEstimator, motor: Part) -> None:
+    rng = np.random.default_rng(0)
+    wavy = rng.uniform(-150, 150, (30_000, 3))
+    wavy[:, 2] = 600 + 15 * np.sin(wavy[:, 0] / 40) * np.cos(wavy[:, 1] / 30)
+    found = estimator.detect(motor, wavy.astype(np.float32), unit="mm")
+    assert all(pose.probability < 0.5 for pose in found.poses)
+    assert (found.reason is None) == bool(found.poses)
+    few = estimator.detect(
+        motor, wavy[:30].astype(np.float32), unit="mm", background=ForegroundOptions(remove_plane="never")
+    )
+    assert not any(pose.probability >= 0.5 for pose in few.poses)
+    scene = replace(estimator.scene(wavy.astype(np.float32), motor, unit="mm"), doubt="say --units cm")
+    strict = replace(estimator, config=DetectConfig(reported=0.99, accepted=0.99))
+    reason = strict.detect(motor, scene, at=wavy[:2]).reason
+    assert reason is not None
+    assert reason.endswith("; say --units cm")
+
+
+def test_an_exported_estimator_finds_the_same_without_this_package(
+    estimator: PoseEstimator, motor: Part, tmp_path: Path
+) -> None:
+    import subprocess
+    import sys
+
+    scan, truth = bin_of(0)
+    scene = estimator.scene(scan, motor)
+    path = tmp_path / "motor.jaxexport"
+    size = export_estimator(estimator, motor, path, 8192)
+    assert size == path.stat().st_size < 8e6
+    points = np.zeros((8192, 3), dtype=np.float32)
+    front = scene.points[scene.foreground]
+    chosen = np.sort(np.random.default_rng(0).permutation(len(front))[:8192])
+    points[: len(chosen)] = front[chosen]
+    np.savez(tmp_path / "scan.npz", points=points, mask=np.arange(8192) < len(chosen))
+    code = f"""
+import sys
+sys.modules["kmn_jax"] = None
+import jax, numpy as np
+program = jax.export.deserialize(bytearray(open({str(path)!r}, "rb").read()))
+scan = np.load({str(tmp_path / "scan.npz")!r})
+found = program.call(scan["points"], scan["mask"], np.zeros(2, np.uint32))
+np.savez({str(tmp_path / "found.npz")!r}, **found)
+assert not any(name.startswith("kmn_jax.") for name in sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, timeout=200)
+    with np.load(tmp_path / "found.npz") as found:
+        best = int(found["probability"].argmax())
+        assert found["keep"][best]
+        assert errors(found["T_scene_object"][best], truth, motor).min() < 0.1
+        assert np.isfinite(found["probability"]).all()
+    with pytest.raises(InputError, match="points is 5"):
+        export_estimator(estimator, motor, path, 5)
+    assert jax.device_count() >= 1

@@ -1,0 +1,101 @@
+"""Poses found the wrong way round are turned to what the depth image shows, and refined."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kmn_jax.detection import Scene, Sight, make_scene, view_of
+from kmn_jax.detection._improve import ImproveConfig, improve, main_turns
+from kmn_jax.detection._verify import VerifyConfig
+from kmn_jax.geometry import Camera, intrinsics, measured_points
+from kmn_jax.io import Scan
+from kmn_jax.objects import ObjectConfig, Part, object_from_mesh
+from kmn_jax.objects._symmetry import rotation_about
+from kmn_jax.pose import mssd
+from kmn_jax.simulate import RayMesh, Surfels, render
+from tests.reference.meshes import Mesh, bracket, camera_scene, notched_box, pose, random_rotations
+from tests.reference.parts import box_part
+
+CAMERA = Camera(500.0, 500.0, 159.5, 119.5, 320, 240)
+TRUE = pose((0.05, -0.02, 3.0), random_rotations(1, 5)[0])
+
+
+@pytest.fixture(scope="module")
+def part() -> Part:
+    return of_mesh(notched_box())
+
+
+def of_mesh(mesh: Mesh) -> Part:
+    found = object_from_mesh("part", *mesh, "m", ObjectConfig(num_points=2048))
+    return Part(
+        "part",
+        "m",
+        found.points.astype(np.float32),
+        found.normals.astype(np.float32),
+        np.zeros((8, 4), np.float32),
+        found.diameter,
+        found.minimum,
+        found.maximum,
+        found.area,
+        found.symmetries,
+        "",
+        "",
+    )
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    depth = render(RayMesh(*notched_box()), camera_scene([TRUE], CAMERA), include_bin=False).depth.astype(np.float32)
+    view = view_of(Scan(measured_points(depth, CAMERA), None, depth, CAMERA, "m"))
+    return make_scene(view, "m", np.ones(len(view.points), dtype=bool), 131_072)
+
+
+def test_turns_are_rotations_about_the_centroid(part: Part) -> None:
+    turns, _ = main_turns(part)
+    assert turns.shape == (23, 4, 4)
+    np.testing.assert_allclose(np.linalg.det(turns[:, :3, :3]), 1, atol=1e-5)
+    center = np.append(part.points.mean(axis=0), 1)
+    np.testing.assert_allclose(turns @ center, np.tile(center, (23, 1)), atol=1e-5)
+
+
+def test_rivals_look_nearly_the_same_but_not_quite(part: Part) -> None:
+    turns, is_rival = main_turns(part)
+    halves = (np.abs(np.diagonal(turns[:, :3, :3], axis1=1, axis2=2)) > 0.99).all(axis=1)
+    assert halves.sum() == 3
+    assert is_rival[halves].all()
+    assert is_rival.sum() <= 4  # the box is too long for most others
+    assert not main_turns(of_mesh(bracket()))[1].any()
+    symmetries = np.stack([np.eye(3), *(rotation_about(axis, np.pi) for axis in np.eye(3))])
+    assert 23 - main_turns(box_part(2000, rotations=symmetries))[1].sum() >= 3
+
+
+def test_turned_poses_come_back(part: Part, scene: Scene) -> None:
+    turns, is_rival = main_turns(part)
+    shift = np.eye(4, dtype=np.float32)
+    shift[:3, 3] = 0.03
+    starts = np.stack([TRUE @ shift, *(TRUE @ turn @ shift for turn in turns[is_rival]), TRUE]).astype(np.float32)
+    seeds = jnp.full(len(starts), len(scene.points) // 2, dtype=jnp.int32)
+    surfels = Surfels(jnp.asarray(part.points), jnp.asarray(part.normals), jnp.float32(part.area))
+    found, there = improve(
+        jnp.asarray(starts),
+        jnp.arange(len(starts)) < len(starts) - 1,
+        seeds,
+        scene.arrays,
+        Sight(scene.depth, intrinsics(CAMERA)),
+        surfels,
+        jnp.asarray(turns),
+        jnp.asarray(is_rival),
+        jnp.float32(part.diameter),
+        jax.random.split(jax.random.key(0), len(starts)),
+        ImproveConfig(margin=2.0),
+        VerifyConfig(),
+    )
+    errors = np.array([[float(mssd(T, TRUE.astype(np.float32), part.points[:300])) for T in row] for row in found[:-1]])
+    assert errors[0, 0] < 0.02 * part.diameter  # the right one stays, refined
+    best = np.where(there[:-1], errors, np.inf).min(axis=1)
+    assert (best < 0.05 * part.diameter).mean() >= 0.75
+    assert not bool(there[-1].any())  # what is not real is skipped
+    assert bool(jnp.isfinite(found).all())

@@ -1,0 +1,121 @@
+"""Selection of hypotheses: distances under symmetries, parts inside of parts, the greedy choice, and its gaps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kmn_jax.detection import SelectConfig, select, symmetry_transforms
+from kmn_jax.detection._select import accept, distances, overlaps, same_place
+from kmn_jax.objects import Symmetries
+from kmn_jax.objects._symmetry import rotation_about
+from tests.reference.meshes import pose, random_rotations
+from tests.reference.parts import box_part
+
+Z = np.array([0.0, 0.0, 1.0])
+BOX = box_part()
+NO_TURN = np.eye(4, dtype=np.float32)[None]
+
+
+def moved(x: float, y: float, z: float, rotation: np.ndarray | None = None) -> np.ndarray:
+    return pose((x, y, z), np.eye(3) if rotation is None else rotation)
+
+
+def pairs(one: np.ndarray, others: list[np.ndarray]) -> jax.Array:
+    return jnp.asarray(np.stack([np.stack([one, other]) for other in others]).astype(np.float32))
+
+
+def apart(one: np.ndarray, others: list[np.ndarray], transforms: np.ndarray = NO_TURN) -> np.ndarray:
+    return np.asarray(distances(pairs(one, others), jnp.asarray(BOX.points), jnp.asarray(transforms)))
+
+
+def test_distances_are_those_of_the_farthest_point() -> None:
+    turn = moved(0, 0, 0, rotation_about(Z, np.pi / 2))
+    farthest = np.linalg.norm(BOX.points - BOX.points @ turn[:3, :3].T, axis=1).max()
+    found = apart(np.eye(4), [np.eye(4), moved(0.3, 0.4, 0), turn])
+    np.testing.assert_allclose(found, [0, 0.5, farthest], rtol=1e-5, atol=1e-5)
+
+
+def test_symmetric_poses_are_the_same() -> None:
+    rotations = np.stack([np.eye(3), rotation_about(Z, np.pi)])
+    transforms = symmetry_transforms(Symmetries(rotations, np.zeros((0, 3)), np.array([0.1, 0, 0]), 0.02))
+    base = pose((1.0, 2.0, 3.0), random_rotations(1, 0)[0])
+    same, other = base @ transforms[1], base @ moved(0, 0, 0, rotation_about(Z, 0.5))
+    found = apart(base, [same, other], transforms)
+    np.testing.assert_allclose(found[0], 0, atol=1e-4)
+    assert found[1] > 0.2
+    np.testing.assert_allclose(transforms[1] @ [0.1, 0, 0, 1], [0.1, 0, 0, 1], atol=1e-6)  # about the centre
+
+
+def test_continuous_symmetries_are_taken_in_steps() -> None:
+    transforms = symmetry_transforms(Symmetries(np.eye(3)[None], Z[None], np.zeros(3), 0.02))
+    assert transforms.shape == (36, 4, 4)
+    found = apart(np.eye(4), [moved(0, 0, 0, rotation_about(Z, np.radians(95)))], transforms)
+    widest = np.linalg.norm(BOX.points[:, :2], axis=1).max()
+    np.testing.assert_allclose(found[0], 2 * widest * np.sin(np.radians(2.5)), rtol=1e-3)
+
+
+def test_what_two_parts_share_is_counted_but_not_where_they_touch() -> None:
+    half_turn = moved(0, 0, 0, rotation_about(Z, np.pi))
+    others = [np.eye(4), moved(5, 0, 0), moved(0, 1.0, 0), moved(0, 0.4, 0), half_turn]
+    spacing = jnp.float32((BOX.area / len(BOX.points)) ** 0.5)
+    found = overlaps(
+        pairs(np.eye(4), others), jnp.asarray(BOX.points), jnp.asarray(BOX.normals), spacing, jnp.float32(0.05)
+    )
+    assert found[0] == 1
+    assert found[1] == 0
+    assert found[2] < 0.1  # they touch
+    assert found[3] > 0.2
+    assert found[4] > 0.7  # the other way round in the same place
+
+
+def test_the_best_of_what_excludes_each_other_is_taken() -> None:
+    score = np.array([0.5, 0.9, 0.8, 0.99, 0.4])
+    usable = np.array([True, True, True, False, True])
+    excluded = np.zeros((5, 5), dtype=bool)
+    for one, other in ((0, 1), (2, 4), (3, 1)):
+        excluded[one, other] = excluded[other, one] = True
+    np.testing.assert_array_equal(accept(score, usable, excluded), [False, True, True, False, False])
+    np.testing.assert_array_equal(accept(score * 0, usable, excluded), [True, False, True, False, False])
+
+
+def test_slender_parts_side_by_side_are_two() -> None:
+    x, y, z = BOX.maximum - BOX.minimum
+    assert same_place(BOX, SelectConfig()) == pytest.approx(min(0.2 * BOX.diameter, sorted((x, y, z))[1] / 2))
+    along, angle = np.linspace(-0.5, 0.5, 256), np.arange(256) * 2.4
+    round_ = np.stack([np.zeros(256), np.cos(angle), np.sin(angle)], axis=1)
+    low = np.array([-0.5, -0.075, -0.075])
+    rod = replace(
+        BOX,
+        points=(0.075 * round_ + along[:, None] * [1, 0, 0]).astype(np.float32),
+        normals=round_.astype(np.float32),
+        minimum=low,
+        maximum=-low,
+        diameter=1.01,
+        area=0.47,
+    )
+    poses = np.stack([moved(0, 0.16 * row, 0) for row in range(3)]).astype(np.float32)
+    assert select(poses, np.array([0.9, 0.8, 0.7]), np.ones(3, dtype=bool), rod, SelectConfig()).kept.all()
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_one_pose_an_instance_is_kept_and_rivals_for_its_place_make_the_gap(first: int) -> None:
+    there = moved(0, 0, 3)
+    near = moved(0.02, 0, 3.01)
+    crossed = there @ moved(0, 0.1, 0.1, rotation_about(Z, np.pi / 2))
+    poses = np.stack([there, near, crossed, moved(0, 2.5, 3)]).astype(np.float32)
+    score = np.array([0.9, 0.8, 0.7, 0.6])
+    score[first] = 0.95
+    found = select(poses, score, np.ones(4, dtype=bool), BOX, SelectConfig())
+    np.testing.assert_array_equal(found.kept, [first == 0, first == 1, False, True])
+    np.testing.assert_allclose(found.gap[first], 0.95 - 0.7)  # not the other form of itself
+    np.testing.assert_allclose(found.gap[3], 0.6)
+    assert not found.contenders.any()
+    close = select(poses, score, np.ones(4, dtype=bool), BOX, SelectConfig(contest=0.3))
+    np.testing.assert_array_equal(close.contenders, [False, False, True, False])
+    without = select(poses, score, np.array([False, False, False, True]), BOX, SelectConfig())
+    np.testing.assert_array_equal(without.kept, [False, False, False, True])
