@@ -13,28 +13,23 @@ from typing import Any
 
 from experiments.evaluate import Options, compare, released_or_own, run
 from experiments.evaluation.cases import Method
-from experiments.evaluation.methods import Ours, OursConfig
-from kmn_jax.detection import CropPoseConfig
+from experiments.evaluation.methods import Ours
+from kmn_jax.detection import CropSearchConfig
 from kmn_jax.models import Model
 
-_PLAIN = CropPoseConfig()
+_PLAIN = CropSearchConfig()
 
 
-def _pose(**changed: Any) -> OursConfig:
-    return OursConfig(replace(_PLAIN, **changed))
+def _matches(**changed: Any) -> CropSearchConfig:
+    return replace(_PLAIN, matches=replace(_PLAIN.matches, **changed))
 
 
-def _matches(**changed: Any) -> OursConfig:
-    return _pose(matches=replace(_PLAIN.matches, **changed))
+def _ransac(**changed: Any) -> CropSearchConfig:
+    return replace(_PLAIN, ransac=replace(_PLAIN.ransac, **changed))
 
 
-def _ransac(**changed: Any) -> OursConfig:
-    return _pose(ransac=replace(_PLAIN.ransac, **changed))
-
-
+KEYPOINTS = {"10 keypoints": 10, "40 keypoints": 40}
 VARIANTS = {
-    "10 keypoints": OursConfig(num_keypoints=10),
-    "40 keypoints": OursConfig(num_keypoints=40),
     "vote threshold 0.5": _matches(vote_threshold=0.5),
     "vote threshold 0.9": _matches(vote_threshold=0.9),
     "softmax over points": _matches(softmax="points"),
@@ -42,21 +37,24 @@ VARIANTS = {
     "100 hypotheses": _ransac(num_hypotheses=100),
     "2000 hypotheses": _ransac(num_hypotheses=2000),
     "gate 0.1": _ransac(distance_gate=0.1),
-    "256 points": OursConfig(num_points=256),
-    "1024 points": OursConfig(num_points=1024),
-    "one draw": _pose(num_draws=1),
-    "two draws": _pose(num_draws=2),
-    "four draws in any case": _pose(enough=None),
-    "enough at 1": _pose(enough=1.0),
-    "one pose a draw": _pose(num_modes=1),
-    "eight poses a draw": _pose(num_modes=8),
-    "no smoothing": _pose(smooth=None),
+    "256 points": replace(_PLAIN, num_points=256),
+    "1024 points": replace(_PLAIN, num_points=1024),
+    "one draw": replace(_PLAIN, num_draws=1),
+    "two draws": replace(_PLAIN, num_draws=2),
+    "four draws in any case": replace(_PLAIN, enough=None),
+    "enough at 1": replace(_PLAIN, enough=1.0),
+    "one pose a draw": replace(_PLAIN, num_modes=1),
+    "eight poses a draw": replace(_PLAIN, num_modes=8),
+    "no smoothing": replace(_PLAIN, smooth=None),
+    "no ICP": replace(_PLAIN, icp=None),
 }
 
 
 def methods_of(model: Model) -> dict[str, Method]:
     """Return our pipeline as it is, and with one choice changed each."""
-    changed = {name.replace(" ", "_"): Ours(name, model, config) for name, config in VARIANTS.items()}
+    fewer = {name: Ours(name, model, num_keypoints=count) for name, count in KEYPOINTS.items()}
+    other = {name: Ours(name, model, config) for name, config in VARIANTS.items()}
+    changed = {name.replace(" ", "_"): method for name, method in (fewer | other).items()}
     return {"ours": Ours("kmn_jax", model), **changed}
 
 

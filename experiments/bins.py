@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from kmn_jax.bop import BopDataset, BopFrame, FrameKey
 from kmn_jax.data import load_models
-from kmn_jax.detection import Scene, View, bin_content, make_scene, view_of
+from kmn_jax.detection import Scene, bin_content, make_scene
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import measured_points
 from kmn_jax.io import Scan
@@ -23,7 +23,6 @@ from kmn_jax.pose import adi
 from kmn_jax.simulate import Bin
 
 _UNIT = "mm"
-_MOST_POINTS = 131_072
 _POINTS = 1000  # of an object's surface, for errors
 THRESHOLD = 0.1  # of the diameter: a pose with less ADI is right
 LEAST_VISIBLE = 0.3  # share of a copy that is seen, from which on it ought to be found
@@ -78,7 +77,7 @@ def bin_images(folder: Path, split: str, model: Model, every: int = 1) -> Iterat
         yield BinImage(
             key,
             part,
-            make_scene(_view(frame), _UNIT, inside[frame.depth > 0], _MOST_POINTS),
+            make_scene(_scan(frame), part.diameter, inside=inside[frame.depth > 0]),
             inside,
             np.stack([instance.T_camera_object for instance in instances]),
             np.array([instance.visible_fraction or 0.0 for instance in instances]),
@@ -90,9 +89,9 @@ def bin_images(folder: Path, split: str, model: Model, every: int = 1) -> Iterat
         )
 
 
-def _view(frame: BopFrame) -> View:
+def _scan(frame: BopFrame) -> Scan:
     depth = frame.depth.astype(np.float32)
-    return view_of(Scan(measured_points(depth, frame.camera), None, depth, frame.camera, _UNIT))
+    return Scan(measured_points(depth, frame.camera), None, depth, frame.camera, _UNIT)
 
 
 def _inside(frame: BopFrame, bin: Bin, T_camera_bin: Float[np.ndarray, "4 4"], part: Part) -> Bool[np.ndarray, "h w"]:

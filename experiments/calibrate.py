@@ -9,37 +9,37 @@ gives the reliability that is printed.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
+from jaxtyping import Int
 from tqdm import tqdm
 
 from experiments.bins import THRESHOLD, bin_images
-from experiments.fpfh import SOLVERS
+from experiments.fpfh import fpfh_poses
 from experiments.reliability_picture import save_reliability
 from experiments.test_sets import SPLIT
 from kmn_jax.detection import (
     EVIDENCE,
     SIGNS,
     Calibration,
-    CandidateConfig,
     Candidates,
+    DetectConfig,
     Probabilities,
     Scene,
-    Seeds,
-    SelectConfig,
-    Solver,
+    SearchConfig,
+    chosen,
+    device_part,
     expected_calibration_error,
-    find_candidates,
     fit_calibration,
-    improved,
     probabilities_bytes,
+    refined_candidates,
     reliability,
+    search_at,
     seeds_over,
-    select,
 )
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
@@ -47,6 +47,7 @@ from kmn_jax.models import Model, load_model, load_pretrained
 from kmn_jax.objects import Part
 from kmn_jax.report import check_target, print_table, write_json
 
+_PLAIN = DetectConfig(reported=0.5)  # what the depth image speaks for more than against
 SHIPPED = Path(__file__).parent.parent / "kmn_jax" / "pretrained" / "small.calibration.json"
 
 
@@ -69,7 +70,8 @@ class Options:
 def collect(options: Options) -> dict[str, np.ndarray]:
     """Return evidence, outcome and object of all poses, and whether they are refined."""
     model = load_pretrained() if options.model is None else load_model(options.model)
-    config = CandidateConfig()
+    config = DetectConfig().search
+    config = replace(config, crops=config.crops.of_network(model.config))
     columns: dict[str, list[np.ndarray]] = {"evidence": [], "error": [], "object": [], "refined": []}
     folders = sorted(path for path in options.bins.glob("*") if (path / SPLIT).is_dir())
     if not folders:
@@ -77,12 +79,12 @@ def collect(options: Options) -> dict[str, np.ndarray]:
     for number, folder in enumerate(folders):
         images = bin_images(folder, SPLIT, model, options.every)
         for image in tqdm(images, unit="image", desc=folder.name):
-            seeds = seeds_over(image.scene, image.scene.foreground, image.part, config)
+            rows = seeds_over(image.scene, image.scene.foreground, image.part)
             parts = [part for part in (image.part, image.stranger) if part is not None]
             for part in parts:
-                stages = _found_and_refined(model, part, image.scene, seeds, config, SOLVERS[options.method])
+                stages = _found_and_refined(options, model, part, image.scene, rows, config)
                 for refined, found in enumerate(stages):
-                    error = image.errors(found.T_view_object[found.usable]).min(axis=1, initial=np.inf)
+                    error = image.errors(found.T_camera_object[found.usable]).min(axis=1, initial=np.inf)
                     columns["evidence"].append(found.evidence[found.usable])
                     columns["error"].append(error if part is image.part else np.full_like(error, np.inf))
                     columns["object"].append(np.full(len(error), 1000 * number + image.key.scene_id))
@@ -91,15 +93,20 @@ def collect(options: Options) -> dict[str, np.ndarray]:
 
 
 def _found_and_refined(
-    model: Model, part: Part, scene: Scene, seeds: Seeds, config: CandidateConfig, solver: Solver | None
+    options: Options, model: Model, part: Part, scene: Scene, rows: Int[np.ndarray, " c"], config: SearchConfig
 ) -> list[Candidates]:
     """Return the poses around seeds, and the refined forms of those that the depth image speaks for."""
-    found = find_candidates(model, part, scene, seeds, 0, config, solver)
-    explained, violated = (found.evidence[:, EVIDENCE.index(name)] for name in ("explained", "violated"))
-    score = np.maximum(explained - violated, 0).astype(np.float64)
-    chosen = select(found.T_view_object, score, found.usable & (score > 0), part, SelectConfig())
-    rows = np.flatnonzero(chosen.kept)
-    return [found, improved(model, part, scene, found, rows, 0, config)] if len(rows) else [found]
+    on_device = device_part(model, part)
+    if options.method == "FPFH":
+        found = fpfh_poses(part, on_device, scene, rows)
+    else:
+        found = search_at(model, on_device, scene, rows, 0, config)
+    weights = tuple({"explained": 1.0, "violated": -1.0}.get(name, 0.0) for name in EVIDENCE)
+    choice = chosen(found, Calibration(EVIDENCE, weights, 0.0), on_device, _PLAIN)
+    kept = np.flatnonzero(choice.kept)
+    if not len(kept):
+        return [found]
+    return [found, refined_candidates(model, part, on_device, scene, found, kept, 0, config)]
 
 
 def fit(

@@ -1,7 +1,7 @@
 """Whole-bin detection on ray-cast bins: `python -m experiments.detect_bins`.
 
 Precision and recall of the copies found in the held-out test sets, by the released network and by Open3D's FPFH +
-RANSAC + ICP in the same search (the first round's seeds are the same, later ones depend on what was found):
+RANSAC + ICP around seeds of the same kind (the first round's are the same, later ones depend on what was found):
 verification, choice and order are the same, and each has probabilities fitted to its own poses in the validation bins.
 A pose is right if its ADI to a copy is below a tenth of the diameter and no more probable pose took that copy; recall
 counts the copies of which at least 30% is visible.
@@ -12,6 +12,7 @@ from __future__ import annotations
 import sys
 from collections import defaultdict
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,24 +28,27 @@ from experiments.test_sets import SPLIT
 from kmn_jax.detection import (
     EVIDENCE,
     THOROUGH,
+    Clock,
     DetectConfig,
     Detections,
     Probabilities,
-    Solver,
+    chosen,
     detect,
+    detections,
+    device_part,
     expected_calibration_error,
+    explore,
     load_probabilities,
+    refined_candidates,
     reliability,
 )
 from kmn_jax.errors import InputError
-from kmn_jax.models import load_model, load_pretrained
+from kmn_jax.models import Model, load_model, load_pretrained
 from kmn_jax.report import check_target, print_table, write_json
 
-METHODS: dict[str, tuple[Solver | None, DetectConfig]] = {
-    "kmn_jax": (None, DetectConfig()),
-    "kmn_jax, thorough": (None, THOROUGH),
-    "FPFH": (fpfh_poses, DetectConfig()),
-}
+CONFIG = DetectConfig()
+METHODS = ("kmn_jax", "kmn_jax, thorough", "FPFH")
+PRECISION = 0.95  # at which recalls are compared
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ class Options:
     model: Path | None = None  # .safetensors; the released model unless given
     sets: tuple[Path, ...] = (Path("outputs/test_sets/electronics"), Path("outputs/test_sets/industrial"))
     every: int = 1  # use every so many images
-    methods: tuple[str, ...] = tuple(METHODS)
+    methods: tuple[str, ...] = METHODS
     calibration: Path = SHIPPED
     fpfh_calibration: Path = Path("outputs/fpfh.calibration.json")  # python -m experiments.calibrate --method FPFH
     json: Path | None = None
@@ -67,11 +71,11 @@ class Tally:
 
     probability: list[float] = field(default_factory=list)
     right: list[bool] = field(default_factory=list)
-    hits: int = 0
+    hit: list[bool] = field(default_factory=list)  # right, on a copy that counts
     copies: int = 0
     seconds: list[float] = field(default_factory=list)
 
-    def add(self, image: BinImage, found: Detections, accepted: float) -> None:
+    def add(self, image: BinImage, found: Detections) -> None:
         """Count the poses of an image."""
         poses = sorted(found.poses, key=lambda pose: -pose.probability)
         visible = image.visible >= LEAST_VISIBLE
@@ -83,22 +87,25 @@ class Tally:
             right = bool(free[best] < THRESHOLD)
             self.probability.append(pose.probability)
             self.right.append(right)
-            if right:
-                taken[best] = True
-                self.hits += bool(visible[best] and pose.probability >= accepted)
+            self.hit.append(right and bool(visible[best]))
+            taken[best] |= right
         self.copies += int(visible.sum())
         self.seconds.append(sum(found.timing.stages.values()))
 
     def row(self, name: str, method: str, accepted: float) -> dict[str, Any]:
         """Return the numbers."""
         probability, right = np.array(self.probability), np.array(self.right, dtype=bool)
-        chosen = probability >= accepted
+        chosen, hit = probability >= accepted, np.array(self.hit, dtype=bool)
+        order = np.argsort(-probability, kind="stable")
+        precise = np.flatnonzero(np.cumsum(right[order]) >= PRECISION * np.arange(1, len(order) + 1))
+        most = hit[order[: precise[-1] + 1]].sum() if len(precise) else 0
         return {
             "bins": name,
             "method": method,
             "images": len(self.seconds),
             "copies": self.copies,
-            "recall": self.hits / max(self.copies, 1),
+            "recall": float(hit[chosen].sum()) / max(self.copies, 1),
+            f"recall at precision {PRECISION}": float(most) / max(self.copies, 1),
             "accepted": int(chosen.sum()),
             "precision": float(right[chosen].mean()) if chosen.any() else None,
             "calibration error": expected_calibration_error(probability, right),
@@ -115,21 +122,17 @@ def run(options: Options) -> dict[str, Any]:
         raise InputError(f"method {unknown[0]!r} is not known: choose among {', '.join(METHODS)}")
     model = load_pretrained() if options.model is None else load_model(options.model)
     fitted: dict[str, Probabilities] = {
-        name: load_probabilities(
-            options.calibration if METHODS[name][0] is None else options.fpfh_calibration, EVIDENCE
-        )
+        name: load_probabilities(options.fpfh_calibration if name == "FPFH" else options.calibration, EVIDENCE)
         for name in options.methods
     }
     tallies: dict[tuple[str, str], Tally] = defaultdict(Tally)
     for folder in options.sets:
         for image in tqdm(bin_images(folder, SPLIT, model, options.every), unit="image", desc=folder.name):
             for name in options.methods:
-                solver, config = METHODS[name]
-                image.scene.features.clear()  # nothing is left of the method before
-                found = detect(model, fitted[name], image.part, image.scene, 0, config, solver=solver)
+                found = _found(name, model, fitted[name], image)
                 for group in (folder.name, f"{folder.name}: {image.part.name}"):
-                    tallies[group, name].add(image, found, config.accepted)
-    rows = [tally.row(*key, METHODS[key[1]][1].accepted) for key, tally in tallies.items()]
+                    tallies[group, name].add(image, found)
+    rows = [tally.row(*key, CONFIG.accepted) for key, tally in tallies.items()]
     total = [row for row in rows if ":" not in row["bins"]]
     print_table("Whole-bin detection", total)
     print_table("By object", [row for row in rows if ":" in row["bins"]])
@@ -147,6 +150,26 @@ def run(options: Options) -> dict[str, Any]:
     write_json(options.json, results)
     save_reliability(curves, options.picture)
     return results
+
+
+def _found(name: str, model: Model, fitted: Probabilities, image: BinImage) -> Detections:
+    """Return what a method finds in an image."""
+    if name != "FPFH":
+        return detect(model, fitted, image.part, image.scene, 0, THOROUGH if "thorough" in name else CONFIG)
+    on_device, clock = device_part(model, image.part), Clock()
+    propose = partial(fpfh_poses, image.part, on_device, image.scene)
+    candidates, warnings = explore(image.scene, image.part, propose, fitted.found, CONFIG, clock)
+    with clock("selection"):
+        choice = chosen(candidates, fitted.found, on_device, CONFIG)
+    rows = np.flatnonzero(choice.kept | choice.contenders)
+    if len(rows):
+        with clock("refinement"):
+            candidates = refined_candidates(
+                model, image.part, on_device, image.scene, candidates, rows, 0, CONFIG.search
+            )
+            choice = chosen(candidates, fitted.refined, on_device, CONFIG)
+    poses = detections(candidates, choice, fitted.refined, image.part, image.scene)
+    return Detections(image.part.name, image.scene.unit, poses, clock.timing, None, warnings)
 
 
 if __name__ == "__main__":

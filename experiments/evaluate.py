@@ -22,7 +22,7 @@ import tyro
 from experiments.evaluation.cases import Method, ObjectImages, limited
 from experiments.evaluation.configs import CONFIGS, OWN_NETWORKS, EvaluateConfig, find_config
 from experiments.evaluation.digests import library_versions, our_code, rivals_code, shared_code
-from experiments.evaluation.methods import ONE_RANSAC, Ours, OursConfig, OwnNetworks
+from experiments.evaluation.methods import ONE_RANSAC, Ours, OwnNetworks
 from experiments.evaluation.predictions import Export, check_files, export
 from experiments.evaluation.refinement import SETTINGS
 from experiments.evaluation.report import Result, draw_pictures, write_report
@@ -141,16 +141,16 @@ def _methods(config: EvaluateConfig, model: Model, networks: Path | None) -> tup
         if name == "ours":
             methods[name] = Ours("kmn_jax", model)
         elif name == "ours_ransac":
-            methods[name] = Ours("kmn_jax, one RANSAC", model, OursConfig(ONE_RANSAC))
+            methods[name] = Ours("kmn_jax, one RANSAC", model, ONE_RANSAC)
         elif name == "ours_no_normals":
             unchecked = replace(ONE_RANSAC, ransac=RansacConfig(use_normals=False))
-            methods[name] = Ours("kmn_jax, one RANSAC, no normal check", model, OursConfig(unchecked))
+            methods[name] = Ours("kmn_jax, one RANSAC, no normal check", model, unchecked)
         elif name == OWN_NETWORKS:
             methods[name] = OwnNetworks("kmn_jax, trained for the object", _own_networks(networks))
         elif name == "ours_open3d":
             reason = missing("open3d")
             if reason is None:
-                methods[name] = Ours("kmn_jax, Open3D RANSAC", model, OursConfig(ONE_RANSAC), OverMatches())
+                methods[name] = Ours("kmn_jax, Open3D RANSAC", model, ONE_RANSAC, search=OverMatches())
         else:
             module, make = RIVALS[name]
             reason = missing(module)

@@ -20,7 +20,7 @@ import tyro
 from jaxtyping import Array, Float, Int
 
 from kmn_jax.bop import BopDataset, BopFrame
-from kmn_jax.data import Crop, CropConfig, DevicePack, Pack, draw_crop, stack_pack, take_scene, visible_points
+from kmn_jax.data import CropConfig, DevicePack, LabelledCrop, Pack, draw_crop, stack_pack, take_scene, visible_points
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import depth_normals
 from kmn_jax.simulate import BIN, VisiblePoints
@@ -96,14 +96,14 @@ def _pack_figure(pack: Pack, name: str, show: ShowData) -> Any:
 @partial(jax.jit, static_argnames=("num_keypoints", "config"))
 def _drawn(
     arrays: DevicePack, drop: Int[Array, ""], key: jax.Array, num_keypoints: int, config: CropConfig
-) -> tuple[VisiblePoints, Crop]:
+) -> tuple[VisiblePoints, LabelledCrop]:
     scene = take_scene(arrays, jnp.int32(0), drop)
     visible = visible_points(scene)
     keypoints = scene.surfels.points[:num_keypoints]
     return visible, draw_crop(key, visible, keypoints, scene.T_camera_object, scene.diameter, config)
 
 
-def _crop_row(axes: Any, crop: Crop, show: ShowData) -> None:
+def _crop_row(axes: Any, crop: LabelledCrop, show: ShowData) -> None:
     mask, is_object = np.asarray(crop.mask), np.asarray(crop.is_object)
     # As the camera sees it: divided by the depth, about the seed.
     points = (np.asarray(crop.points) + np.asarray(crop.seed))[mask]

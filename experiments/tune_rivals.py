@@ -12,7 +12,7 @@ from pathlib import Path
 
 from experiments.evaluate import Options, compare, released_or_own, run
 from experiments.evaluation.cases import Method
-from experiments.evaluation.methods import ONE_RANSAC, Ours, OursConfig
+from experiments.evaluation.methods import ONE_RANSAC, Ours
 from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kiss, OverMatches, PointPairs, missing
 from experiments.evaluation.tuned import RIVALS
 from kmn_jax.errors import InputError
@@ -33,8 +33,8 @@ def methods_of(name: str, model: Model) -> dict[str, Method]:
     """Return a rival with each of the settings."""
     methods: Iterable[Method]
     if name == "ours_open3d":
-        one = OursConfig(ONE_RANSAC)
-        methods = [Ours(f"Open3D RANSAC {gate:g}", model, one, OverMatches(gate=gate)) for gate in _GATES]
+        one = ONE_RANSAC
+        methods = [Ours(f"Open3D RANSAC {gate:g}", model, one, search=OverMatches(gate=gate)) for gate in _GATES]
     elif name == "ppf":
         methods = [_point_pairs(*setting, smooth) for smooth in (False, True) for setting in _PAIRS]
     elif name == "fgr":

@@ -18,12 +18,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
     from kmn_jax.detection import Detections
-    from kmn_jax.io import Scan
     from kmn_jax.objects import Part
 
 Units = Literal["auto", "mm", "cm", "m", "in"]
 
-_SAME_SIZE = 0.03  # between the lengths of a part and of the same one in a dataset
 _VECTORS = ("--at", "--sensor", "--roi")  # flags whose values may begin with a minus sign
 
 
@@ -43,8 +41,8 @@ class Request:
     """Unit of the scene's lengths; auto: that of the object, or what the format says."""
     object_units: Units = "auto"
     """Unit of the object's lengths; auto: what the format says, else millimetres."""
-    seed: int = 0
-    """Of all that is random: the same inputs and seed give the same poses."""
+    random_seed: int = 0
+    """Of all that is random: the same inputs and number give the same poses."""
     background: Path | None = None
     """Scan of the empty bin, of the scene's format and unit: what is near to it is no part."""
     roi: str | None = None
@@ -82,7 +80,7 @@ def prepare(
     print(f"{part.name}: {_size(part)}, {_symmetry(part)}; wrote {target}")
 
 
-def estimate(
+def detect(
     request: Annotated[Request, tyro.conf.arg(name="")],
     top: int | None = None,
     json: Path | None = None,
@@ -115,16 +113,16 @@ def estimate(
         found = replace(found, poses=found.poses[:top])
     print(table(found, session.estimator.config.accepted))
     if json is not None:
-        facts = {"seed": request.seed, "weights": request.weights, "model": session.part.model_digest}
+        facts = {"seed": request.random_seed, "weights": request.weights, "model": session.part.model_digest}
         write_json(as_json(found, str(request.object), str(request.scene), facts), json)
         print(f"wrote {json}")
     if bop_csv is not None:
-        write_bop_csv(found, bop_csv, *session.bop_ids)
+        write_bop_csv(found, bop_csv, *session.scene.bop_ids)
         print(f"wrote {bop_csv}")
     if save_picture is not None:
         from kmn_jax.viz import save_picture as draw
 
-        draw(save_picture, session.scene.view, session.part, found, session.truth)
+        draw(save_picture, session.scene, session.part, found, session.scene.truth)
         print(f"wrote {save_picture}")
 
 
@@ -147,7 +145,7 @@ def view(
     found = session.detect(session.places)
     print(table(found, session.estimator.config.accepted))
     with Viewer(
-        session.scene.view, session.part, found, host, port, on_pick=lambda point: session.detect(point[None])
+        session.scene, session.part, found, host, port, on_pick=lambda point: session.detect(point[None])
     ) as page:
         print(f"open {page.url}; stop with Ctrl+C", flush=True)
         page.wait()
@@ -209,44 +207,32 @@ class _Session:
         region: Any = None if request.roi is None else tuple(_numbers(request.roi, "--roi", 6))
         sensor = None if request.sensor is None else np.array(_numbers(request.sensor, "--sensor", 3))
         self.places = np.array(places) if places else None
-        self.truth: tuple[Float[np.ndarray, "4 4"], ...] | None = None
-        self.bop_ids = (0, 0, 1)  # scene, image, object
         self._request, self._clock = request, Clock()
         with self._clock("part"):
             self.estimator = PoseEstimator.from_pretrained(request.weights, THOROUGH if request.thorough else None)
             self.part = self.estimator.prepare(request.object, _unit(request.object_units))
         with self._clock("scene"):
-            scan = self._read(request.scene)
-            empty = None if request.background is None else self._read(request.background)
-            background = ForegroundOptions(empty, region, request.plane)
-            self.scene = self.estimator.scene(scan, self.part, sensor=sensor, at=self.places, background=background)
+            empty = None
+            if request.background is not None:
+                empty = self.estimator.read(request.background, self.part, request.units, request.camera)
+            self.scene = self.estimator.scene(
+                request.scene,
+                self.part,
+                unit=request.units,
+                camera=request.camera,
+                sensor=sensor,
+                at=self.places,
+                background=ForegroundOptions(empty, region, request.plane),
+            )
 
     def detect(self, places: Float[np.ndarray, "k 3"] | None) -> Detections:
         """Search the scan, or places of it only."""
         from kmn_jax.detection import Clock
 
         clock, self._clock = self._clock, Clock()
-        return self.estimator.detect(self.part, self.scene, seed=self._request.seed, at=places, clock=clock)
-
-    def _read(self, path: Path) -> Scan:
-        from kmn_jax.bop import bop_scan, bop_scene_id, bop_sizes, is_bop_image
-        from kmn_jax.io import read_scan, resolve_unit
-
-        request = self._request
-        if request.camera is not None or not is_bop_image(path):
-            return read_scan(path, resolve_unit(request.units, self.part.unit), request.camera)
-        scan, instances = bop_scan(path, resolve_unit(request.units, self.part.unit, "mm"))
-        if path == request.scene:
-            part, sizes = self.part.in_unit("mm"), bop_sizes(path)
-            own = (part.diameter, *np.sort(part.maximum - part.minimum))
-            # A dataset's object of another size is not the part; of several that may be, none is known to be.
-            objects = {instance.object_id for instance in instances or ()}
-            alike = [number for number in objects if np.allclose(sizes.get(number, own), own, rtol=_SAME_SIZE)]
-            self.bop_ids = (bop_scene_id(path), int(path.stem), alike[0] if len(alike) == 1 else 1)
-            if len(alike) == 1:
-                copies = [instance for instance in instances or () if instance.object_id == alike[0]]
-                self.truth = tuple(instance.T_camera_object for instance in copies)
-        return scan
+        return self.estimator.detect(
+            self.part, self.scene, at=places, random_seed=self._request.random_seed, clock=clock
+        )
 
 
 def _unit(units: Units) -> str | None:
@@ -299,7 +285,7 @@ def _keep_compiled() -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line: 0 is success, 2 bad input (one sentence on stderr), 1 our own failure."""
     arguments = _joined(sys.argv[1:] if arguments is None else arguments)
-    commands: dict[str, Any] = {call.__name__: call for call in (prepare, estimate, view, export, convert)}
+    commands: dict[str, Any] = {call.__name__: call for call in (prepare, detect, view, export, convert)}
     try:
         _keep_compiled()
         tyro.extras.subcommand_cli_from_dict(commands, prog="kmn", args=arguments)

@@ -14,8 +14,8 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from kmn_jax.detection import SceneArrays, padded_points
 from kmn_jax.errors import InputError
+from kmn_jax.geometry import PaddedCloud, pad_cloud
 from kmn_jax.objects import ObjectModel
 
 UNIT = "mm"
@@ -176,9 +176,9 @@ def limited(objects: Sequence[ObjectImages], names: Sequence[str]) -> list[Objec
     return [found for found in objects if not names or found.name in names]
 
 
-def padded(points: Float32[np.ndarray, "n 3"]) -> SceneArrays:
+def padded(points: Float32[np.ndarray, "n 3"]) -> PaddedCloud:
     """Return a crop in a capacity of few possible ones, its first point still the first."""
     if len(points) > _MOST_PADDED:
         rows = 1 + np.random.default_rng(0).choice(len(points) - 1, _MOST_PADDED - 1, replace=False)
         points = points[np.concatenate([[0], np.sort(rows)])]
-    return SceneArrays(*padded_points(points, _LEAST_PADDED))
+    return pad_cloud(points, _LEAST_PADDED)

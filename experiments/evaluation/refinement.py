@@ -7,19 +7,19 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 
 from experiments.evaluation.cases import Case, padded
-from kmn_jax.data import CropConfig
-from kmn_jax.detection import first_crop
-from kmn_jax.geometry import SmoothConfig
+from kmn_jax.geometry import PaddedCloud, SmoothConfig, draw_rows, with_normals
 from kmn_jax.objects import ObjectModel
 from kmn_jax.pose import IcpConfig, icp
+from kmn_jax.typing import PRNGKey, Scalar
 
 CONFIG = IcpConfig(iterations=20)
 _OBJECT_POINTS = 1024
-_CROP = CropConfig(num_points=512, max_noise=0.0, normal_points=4096, min_points=16, smooth=SmoothConfig())
-SETTINGS = {"icp": CONFIG, "object points": _OBJECT_POINTS, "scene": _CROP}
+_POINTS, _DRAWN = 512, 4096  # of a crop, and of all that its normals are estimated from
+_SMOOTH = SmoothConfig()
+SETTINGS = {"icp": CONFIG, "object points": _OBJECT_POINTS, "points": (_POINTS, _DRAWN), "smooth": _SMOOTH}
 
 
 class Refinement:
@@ -34,19 +34,34 @@ class Refinement:
         origin = case.points[0].astype(np.float64)
         pose = T_camera_object.copy()
         pose[:3, 3] -= origin
-        crop = _crop(padded(case.points), self._diameter, jax.random.key(case.random_seed))
+        points, normals, mask = _points(padded(case.points), self._diameter, jax.random.key(case.random_seed))
         fine = _fine(
             self._points,
-            crop.points,
+            points,
             pose.astype(np.float32),
             self._diameter,
-            scene_normals=crop.normals,
-            scene_mask=crop.mask,
+            scene_normals=normals,
+            scene_mask=mask,
         )
         pose = np.asarray(fine.T_scene_object, dtype=np.float64)
         pose[:3, 3] += origin
         return pose
 
 
-_crop = jax.jit(partial(first_crop, config=_CROP))  # of points around the first one, for every capacity
+@jax.jit
+def _points(
+    cloud: PaddedCloud, diameter: Scalar, key: PRNGKey
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"]]:
+    """Return points around a cloud's first one, relative to it, smoothed, with their normals; and which are real."""
+    offsets = cloud.points - cloud.points[:1]
+    inside = cloud.mask & ((offsets**2).sum(axis=1) <= diameter**2)
+    key = jax.random.split(key, 3)[0]
+    rows, drawn, kept = draw_rows(key, inside.astype(jnp.float32), jnp.int32(0), jnp.bool_(True), _DRAWN, _POINTS)
+    around = jnp.where(drawn[:, None], offsets[rows], 0)
+    mask = drawn[kept]
+    camera = -cloud.points[0]
+    points, normals = with_normals(around[kept], mask, around, drawn, camera, diameter, 0.0, _SMOOTH)
+    return points, normals, mask
+
+
 _fine = jax.jit(partial(icp, config=CONFIG))

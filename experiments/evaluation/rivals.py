@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.evaluation.cases import Case, Solver
-from kmn_jax.detection import padded_points
-from kmn_jax.geometry import smoothed
+from kmn_jax.geometry import pad_cloud, smoothed
 from kmn_jax.objects import ObjectModel
 from kmn_jax.pose import Matches
 
@@ -312,8 +311,8 @@ def _smoothed(thinned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "p 3"
 
     origin = points[0].astype(np.float64)
     rows = np.random.default_rng(0).choice(len(points), min(_SMOOTHED_BY, len(points)), replace=False)
-    few, mask = padded_points((thinned - origin).astype(np.float32), _SMOOTHED[0])
-    many, there = padded_points((points[rows] - origin).astype(np.float32), _SMOOTHED_BY)
+    few, mask = pad_cloud((thinned - origin).astype(np.float32), _SMOOTHED[0])
+    many, there = pad_cloud((points[rows] - origin).astype(np.float32), _SMOOTHED_BY)
     moved, normals, known, _ = jax.device_get(_smooth(few, mask, many, there, np.float32(diameter)))
     real = np.asarray(mask) & known
     cloud = open3d.geometry.PointCloud(_vectors(moved[real] + origin))
@@ -330,9 +329,9 @@ def compile_smoothing(settings: FeatureSettings | None) -> None:
     """Compile for all sizes of a thinned crop, if it is to be smoothed, before a solver's time is taken."""
     if settings is None or not settings.smooth:
         return
-    many, there = padded_points(np.zeros((1, 3), np.float32), _SMOOTHED_BY)
+    many, there = pad_cloud(np.zeros((1, 3), np.float32), _SMOOTHED_BY)
     for size in _SMOOTHED:
-        few, mask = padded_points(np.zeros((1, 3), np.float32), size)
+        few, mask = pad_cloud(np.zeros((1, 3), np.float32), size)
         jax.block_until_ready(_smooth(few, mask, many, there, np.float32(1)))
 
 

@@ -15,7 +15,7 @@ from experiments.evaluation.cases import UNIT, Image, ObjectImages
 from experiments.evaluation.clouds import camera_of, mesh_of, scans_with_poses
 from kmn_jax.bop import NAMES_FILE, BopDataset, BopFrame, FrameKey
 from kmn_jax.data import load_models
-from kmn_jax.detection import bin_content, foreground, view_of
+from kmn_jax.detection import bin_content, foreground, make_scene
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import measured_points
 from kmn_jax.io import Scan, read_file, read_scan
@@ -107,12 +107,11 @@ class CloudImages:
         path, poses = self.files[row]
         scale = METRES[self.unit] / METRES[UNIT]
         scan = read_scan(path, self.unit, self.camera).in_unit(UNIT)
-        view = view_of(scan, None if self.sensor is None else self.sensor * scale)
+        scene = make_scene(scan, self.model.diameter, sensor=None if self.sensor is None else self.sensor * scale)
         scaled = poses.copy()
         scaled[:, :3, 3] *= scale
-        front, _ = foreground(Scan(view.points, None, None, None, UNIT), self.model.diameter)
-        T_view_object = np.linalg.inv(view.T_scene_view) @ scaled
-        return Image(path.name, view.points, front, T_view_object, np.full(len(poses), np.nan))
+        T_camera_object = np.linalg.inv(scene.T_scene_camera) @ scaled
+        return Image(path.name, scene.points, scene.foreground, T_camera_object, np.full(len(poses), np.nan))
 
 
 def cloud_objects(

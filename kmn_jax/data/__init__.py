@@ -2,7 +2,7 @@
 
 from kmn_jax.data._bop_crops import BopCropConfig, BopCrops, load_models
 from kmn_jax.data._build import Record, Source, build_pack, one_thread_a_process
-from kmn_jax.data._crops import Crop, CropConfig, NormalSource, camera_normals, crop_around, draw_crop
+from kmn_jax.data._crops import CropConfig, LabelledCrop, NormalSource, draw_crop, labelled_crop_around
 from kmn_jax.data._device_pack import DevicePack, StackedPack, stack_pack, take_scene, visible_points
 from kmn_jax.data._pack import SPLITS, Pack, PackedObject
 from kmn_jax.data._pipeline import BatchIterator, PipelineConfig, SampleBatches, SampleIndex
@@ -13,9 +13,9 @@ __all__ = [
     "BatchIterator",
     "BopCropConfig",
     "BopCrops",
-    "Crop",
     "CropConfig",
     "DevicePack",
+    "LabelledCrop",
     "NormalSource",
     "Pack",
     "PackConfig",
@@ -28,9 +28,8 @@ __all__ = [
     "StackedPack",
     "bin_scenes",
     "build_pack",
-    "camera_normals",
-    "crop_around",
     "draw_crop",
+    "labelled_crop_around",
     "load_models",
     "one_thread_a_process",
     "rendered_frame",

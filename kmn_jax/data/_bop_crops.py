@@ -13,14 +13,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int32
 
 from kmn_jax.bop import BopDataset, BopFrame, BopInstance, FrameKey
-from kmn_jax.data._crops import Crop, CropConfig, crop_around
+from kmn_jax.data._crops import CropConfig, LabelledCrop, labelled_crop_around
 from kmn_jax.data._pipeline import SampleIndex
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import measured_points
 from kmn_jax.objects import ObjectConfig, ObjectModel, load_object
 from kmn_jax.simulate import BIN, VisiblePoints
 
-_crop_around = jax.jit(crop_around, static_argnames="config")
+_crop_around = jax.jit(labelled_crop_around, static_argnames="config")
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class BopCropConfig:
 class FrameCrops(NamedTuple):
     """A batch of crops and what they show."""
 
-    crop: Crop  # each array with a leading axis b; `instance` counts those of the frame
+    crop: LabelledCrop  # each array with a leading axis b; `instance` counts those of the frame
     object: Int32[np.ndarray, " b"]  # row in `BopCrops.object_ids`
     frame: Int32[np.ndarray, " b"]  # row in `BopCrops.keys`
     mask: Bool[np.ndarray, " b"]  # false for padding of the batch
@@ -116,10 +116,10 @@ class BopCrops:
             objects += [which] * len(made)
             crops += made
             start = stop
-        stacked: Crop = jax.tree.map(lambda *parts: np.stack(parts), *crops)
+        stacked: LabelledCrop = jax.tree.map(lambda *parts: np.stack(parts), *crops)
         return FrameCrops(stacked, np.array(objects, dtype=np.int32), index.object, index.mask)
 
-    def _crops(self, row: int, keys: np.ndarray) -> tuple[int, list[Crop]]:
+    def _crops(self, row: int, keys: np.ndarray) -> tuple[int, list[LabelledCrop]]:
         """Return the row of an object and one crop of its instances for each key."""
         key = self.keys[row]
         try:
@@ -128,7 +128,7 @@ class BopCrops:
             self._add_problem(str(error))
             return 0, [self._empty_crop(keys[0])] * len(keys)
         view = _View(frame, self._surfaces, self.config)
-        crops: list[Crop] = []
+        crops: list[LabelledCrop] = []
         object_id = None
         for sample_key in keys:
             words = [int(word) for word in sample_key]
@@ -143,7 +143,7 @@ class BopCrops:
 
     def _crop(
         self, view: _View, instance: int, seed: Float[np.ndarray, "3"], key: np.ndarray, rng: np.random.Generator
-    ) -> Crop:
+    ) -> LabelledCrop:
         """Return the crop around a seed: its points are drawn here, so that arrays of one small size go into jit."""
         config, placed = self.config.crop, view.instances[instance]
         surface = self._surfaces[placed.object_id]
@@ -156,10 +156,10 @@ class BopCrops:
         points = np.concatenate([seed[None], view.points[drawn]])
         copies = np.array([0, *np.where(owners == instance, 0, np.where(owners == BIN, BIN, 1))])
         crop: Any = self._jitted(key, points, copies, placed.T_camera_object, surface.model)
-        made: Crop = crop._replace(instance=np.int32(instance), num_inside=np.int32(1 + len(others)))
+        made: LabelledCrop = crop._replace(instance=np.int32(instance), num_inside=np.int32(1 + len(others)))
         return made
 
-    def _empty_crop(self, key: np.ndarray) -> Crop:
+    def _empty_crop(self, key: np.ndarray) -> LabelledCrop:
         return self._jitted(key, np.zeros((0, 3)), np.zeros(0), np.eye(4), self.models[0])
 
     def _jitted(
@@ -169,7 +169,7 @@ class BopCrops:
         copies: np.ndarray,
         T_camera_object: Float[np.ndarray, "4 4"],
         model: ObjectModel,
-    ) -> Crop:
+    ) -> LabelledCrop:
         """Return the crop of points around the first, which lies on copy 0."""
         count, capacity = len(points), self.config.crop.num_drawn
         arrays: dict[str, Any] = {
@@ -194,7 +194,7 @@ class BopCrops:
                 diameter,
                 config=self.config.crop,
             )
-            result: Crop = jax.tree.map(np.asarray, crop)
+            result: LabelledCrop = jax.tree.map(np.asarray, crop)
         return result
 
     def _add_problem(self, problem: str) -> None:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from kmn_jax.geometry import SmoothConfig, nearest, normals_within_radius, orient_to_camera, smoothed, transform_points
+from kmn_jax.geometry import SmoothConfig, draw_rows, nearest, orient_to_camera, transform_points, with_normals
 from kmn_jax.simulate import BIN, VisiblePoints
 from kmn_jax.typing import Pose, PRNGKey, Scalar
 
@@ -63,7 +63,7 @@ class CropConfig:
         return self.num_points if self.normals == "surface" else max(self.num_points, self.normal_points)
 
 
-class Crop(NamedTuple):
+class LabelledCrop(NamedTuple):
     """Points around a seed point, which is the origin and the first of them; axes are the camera's.
 
     If `valid` is false, no visible point may be a seed or too few are around it; all is finite even so.
@@ -89,7 +89,7 @@ def draw_crop(
     T_camera_object: Float[Array, "c 4 4"],
     diameter: Scalar,
     config: CropConfig = CropConfig(),
-) -> Crop:
+) -> LabelledCrop:
     """Draw a seed among the visible object points, in proportion to the picture area covered, and the crop around it.
 
     In the configured share of the draws, the seed's copy is drawn first, all being equally likely.
@@ -97,10 +97,10 @@ def draw_crop(
     _check_points(visible)
     seed_key, crop_key = jax.random.split(key)
     row, found = _draw_seed(seed_key, visible, config)
-    return crop_around(crop_key, visible, row, found, keypoints_object, T_camera_object, diameter, config)
+    return labelled_crop_around(crop_key, visible, row, found, keypoints_object, T_camera_object, diameter, config)
 
 
-def crop_around(
+def labelled_crop_around(
     key: PRNGKey,
     visible: VisiblePoints,
     seed_row: Int[Array, ""],
@@ -109,7 +109,7 @@ def crop_around(
     T_camera_object: Float[Array, "c 4 4"],
     diameter: Scalar,
     config: CropConfig = CropConfig(),
-) -> Crop:
+) -> LabelledCrop:
     """Draw the points of a crop around the seed in a row, without replacement; `found` tells whether it is one.
 
     They are drawn as pixels of an image would be: in proportion to the picture area that each covers. Noise is added
@@ -123,7 +123,8 @@ def crop_around(
     inside = found & (weights > 0) & (x**2 + y**2 + z**2 <= (config.radius * diameter) ** 2)
     if not config.include_bin:
         inside = inside & (visible.instance != BIN)
-    rows, drawn, kept = _draw_rows(draw_key, jnp.where(inside, weights, 0), seed_row, found, config)
+    likely = jnp.where(inside, weights, 0)
+    rows, drawn, kept = draw_rows(draw_key, likely, seed_row, found, config.num_drawn, config.num_points)
 
     exact = jnp.where(drawn[:, None], visible.points[rows], 0)
     sigma = config.max_noise * diameter * jax.random.uniform(sigma_key)
@@ -134,13 +135,10 @@ def crop_around(
     mask = drawn[: kept.shape[0]]
     rows, exact, points = rows[kept], exact[kept], noisy[kept]
     if config.normals == "surface":
-        normals, known = visible.normals[rows], mask
-    elif config.smooth is not None:
-        points, normals, known, _ = smoothed(points, mask, noisy, drawn, diameter, config.smooth)
-        seed, points = seed + points[0], jnp.where(mask[:, None], points - points[:1], 0)
+        normals = jnp.where(mask[:, None], orient_to_camera(points, visible.normals[rows], -seed), 0)
     else:
-        normals, known = normals_within_radius(points, noisy, config.normal_radius * diameter, drawn)
-    normals = jnp.where(mask[:, None], camera_normals(points, normals, known, -seed), 0)
+        points, normals = with_normals(points, mask, noisy, drawn, -seed, diameter, config.normal_radius, config.smooth)
+        seed, points = seed + points[0], jnp.where(mask[:, None], points - points[:1], 0)
 
     instance = jnp.where(found, visible.instance[seed_row], 0)
     pose = jnp.where(found, T_camera_object[instance].astype(jnp.float32), jnp.eye(4))
@@ -150,7 +148,7 @@ def crop_around(
     def padded(rows: Shaped[Array, "drawn ..."]) -> Shaped[Array, "n ..."]:
         return jnp.pad(rows, ((0, config.num_points - rows.shape[0]), *((0, 0) for _ in rows.shape[1:])))
 
-    return Crop(
+    return LabelledCrop(
         points=padded(points),
         normals=padded(normals),
         mask=padded(mask),
@@ -163,13 +161,6 @@ def crop_around(
         num_inside=num_inside,
         valid=num_inside >= config.min_points,
     )
-
-
-def camera_normals(
-    points: Float[Array, "n 3"], normals: Float[Array, "n 3"], known: Bool[Array, " n"], camera: Float[Array, "3"]
-) -> Float[Array, "n 3"]:
-    """Return normals turned towards a camera; where one is not known, the direction to it."""
-    return jnp.where(known[:, None], orient_to_camera(points, normals, camera), _unit(camera[None] - points))
 
 
 def _check_points(visible: VisiblePoints) -> None:
@@ -194,58 +185,3 @@ def _draw_seed(key: PRNGKey, visible: VisiblePoints, config: CropConfig) -> tupl
     place = jax.random.randint(place_key, (), 0, jnp.maximum(ends[-1], 1))
     row = jnp.searchsorted(ends, place, side="right")
     return jnp.minimum(row, ends.shape[0] - 1), ends[-1] > 0
-
-
-def _draw_rows(
-    key: PRNGKey, weights: Float[Array, " r"], seed_row: Int[Array, ""], found: Bool[Array, ""], config: CropConfig
-) -> tuple[Int[Array, " drawn"], Bool[Array, " drawn"], Int[Array, " n"]]:
-    """Return rows to draw, the seed's first; which of them there are, all in front; and which become the crop.
-
-    Both draws are in proportion to the weights, as far as no row can be drawn twice: where the many for the normals
-    include all of the heavy rows, the few of the crop still prefer them.
-    """
-    many_key, few_key = jax.random.split(key)
-    others = min(config.num_drawn, weights.shape[0]) - 1
-    weights = weights.at[seed_row].set(0)
-    likely = _likelihoods(weights, others)
-    rows, there = _systematic(many_key, likely, others)
-    again = jnp.where(there, weights[rows] / jnp.where(there, likely[rows], 1), 0)
-    few = min(config.num_points - 1, others)
-    chosen, _ = _systematic(few_key, _likelihoods(again, few), few)
-    total = there.sum(dtype=jnp.int32)
-    kept = jnp.where(total > few, chosen, jnp.arange(few, dtype=jnp.int32))
-    rows = jnp.concatenate([seed_row[None].astype(jnp.int32), rows])
-    return rows, jnp.concatenate([found[None], there]), jnp.concatenate([jnp.zeros(1, dtype=jnp.int32), 1 + kept])
-
-
-def _systematic(
-    key: PRNGKey, likely: Float[Array, " r"], count: int
-) -> tuple[Int[Array, " count"], Bool[Array, " count"]]:
-    """Draw rows without replacement, each as likely as said, and tell which of the `count` there are.
-
-    Rows lie side by side, each as long as it is likely, and one point in every unit of length, all at one random
-    distance from its beginning, names a row.
-    """
-    if count == 0:
-        return jnp.zeros(0, dtype=jnp.int32), jnp.zeros(0, dtype=bool)
-    unit = min(2**16, 2**30 // count)
-    ends = jnp.cumsum(jnp.ceil(likely * unit).astype(jnp.int32))
-    places = jax.random.randint(key, (), 0, unit) + unit * jnp.arange(count, dtype=jnp.int32)
-    rows = jnp.minimum(jnp.searchsorted(ends, places, side="right"), likely.shape[0] - 1).astype(jnp.int32)
-    return rows, places < ends[-1]
-
-
-def _likelihoods(weights: Float[Array, " r"], count: int) -> Float[Array, " r"]:
-    """Return how likely each row is drawn: in proportion to its weight, at most 1, about `count` in sum."""
-    scale = count / jnp.maximum(weights.sum(), _TINY)
-    for _ in range(3):  # what one row cannot have falls to the others
-        full = weights * scale >= 1
-        rest = jnp.maximum(jnp.where(full, 0, weights).sum(), _TINY)
-        scale = jnp.maximum(scale, (count - full.sum(dtype=jnp.float32)) / rest)
-    some = weights > 0
-    return jnp.where(some, jnp.where(some.sum() <= count, 1, jnp.minimum(weights * scale, 1)), 0)
-
-
-def _unit(vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    length = jnp.sqrt((vectors**2).sum(axis=1, keepdims=True))
-    return vectors / jnp.where(length > 0, length, 1)

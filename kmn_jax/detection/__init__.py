@@ -1,8 +1,8 @@
 """From a scan to the ranked poses of an object's copies."""
 
-from kmn_jax.detection._background import bin_content
-from kmn_jax.detection._bin_poses import BinPosesConfig, bin_part, bin_poses
-from kmn_jax.detection._calibrate import (
+from kmn_jax.detection._background import BinMargins, away_from_empty, bin_content, in_front_of_empty, inside_bin
+from kmn_jax.detection._bin_program import BinPoses, BinPosesConfig, DeviceCalibration, bin_poses, device_calibration
+from kmn_jax.detection._calibration import (
     Calibration,
     Probabilities,
     expected_calibration_error,
@@ -11,118 +11,151 @@ from kmn_jax.detection._calibrate import (
     probabilities_bytes,
     reliability,
 )
-from kmn_jax.detection._candidates import (
-    CandidateConfig,
-    Candidates,
-    Seeds,
-    Solver,
-    find_candidates,
-    improved,
-    seeds_over,
-)
-from kmn_jax.detection._crop_pose import (
-    CropPoseConfig,
-    Said,
-    crop_for_draws,
-    crop_pose,
+from kmn_jax.detection._canonical import canonical_pose
+from kmn_jax.detection._coverage import CoverageConfig
+from kmn_jax.detection._crop_search import (
+    CropPoses,
+    CropSearchConfig,
+    Draw,
+    DrawsSearch,
+    Prediction,
     draw_of_crop,
+    find_poses_in_crop,
     matches_of,
+    poses_in_crop,
     poses_of_draw,
+    predict,
     refined,
-    said_of_draw,
+    search_crop,
     search_draws,
     surface_scores,
 )
-from kmn_jax.detection._detect import THOROUGH, DetectConfig, detect
-from kmn_jax.detection._estimator import PoseEstimator
-from kmn_jax.detection._evidence import EVIDENCE, SIGNS, Sight
+from kmn_jax.detection._depth_agreement import (
+    DepthAgreement,
+    DepthAgreementConfig,
+    DepthImage,
+    depth_agreement,
+    depth_buffer,
+)
+from kmn_jax.detection._detect import THOROUGH, DetectConfig, chosen, detect, detections, explore, refined_candidates
+from kmn_jax.detection._device_part import DevicePart, device_part, same_place, symmetry_transforms
+from kmn_jax.detection._estimator import PartSource, PoseEstimator, ScanSource
+from kmn_jax.detection._evidence import EVIDENCE, SIGNS, gather_evidence
 from kmn_jax.detection._export import export_estimator
 from kmn_jax.detection._foreground import ForegroundOptions, foreground
 from kmn_jax.detection._frames import into, placed
+from kmn_jax.detection._mapping import call_rows, map_real, map_rows
+from kmn_jax.detection._outline import OutlineAgreement, outline_agreement
 from kmn_jax.detection._output import as_json, table, write_bop_csv, write_json
-from kmn_jax.detection._result import CropPrediction, Detection, Detections
-from kmn_jax.detection._scan_crop import SceneArrays, first_crop, padded_points
+from kmn_jax.detection._result import CropPrediction, Detection, Detections, Timing
 from kmn_jax.detection._scene import Scene, make_scene
 from kmn_jax.detection._search import (
-    CropFeatures,
-    Hypotheses,
-    Predictions,
+    Candidates,
     SearchConfig,
-    crop_features,
-    search,
+    candidates_of,
+    join,
+    network_prediction,
+    poses_at,
+    search_at,
+    seed_crop,
     seed_keys,
-    spread_seeds,
 )
-from kmn_jax.detection._select import SelectConfig, select, symmetry_transforms
+from kmn_jax.detection._seeds import NUM_SEEDS, seeds_at, seeds_over, spread_seeds
+from kmn_jax.detection._selection import Selection, select, select_poses
 from kmn_jax.detection._timing import Clock
-from kmn_jax.detection._view import View, view_of
 
 __all__ = [
     "EVIDENCE",
+    "NUM_SEEDS",
     "SIGNS",
     "THOROUGH",
+    "BinMargins",
+    "BinPoses",
     "BinPosesConfig",
     "Calibration",
-    "CandidateConfig",
     "Candidates",
     "Clock",
-    "CropFeatures",
-    "CropPoseConfig",
+    "CoverageConfig",
+    "CropPoses",
     "CropPrediction",
+    "CropSearchConfig",
+    "DepthAgreement",
+    "DepthAgreementConfig",
+    "DepthImage",
     "DetectConfig",
     "Detection",
     "Detections",
+    "DeviceCalibration",
+    "DevicePart",
+    "Draw",
+    "DrawsSearch",
     "ForegroundOptions",
-    "Hypotheses",
+    "OutlineAgreement",
+    "PartSource",
     "PoseEstimator",
-    "Predictions",
+    "Prediction",
     "Probabilities",
-    "Said",
+    "ScanSource",
     "Scene",
-    "SceneArrays",
     "SearchConfig",
-    "Seeds",
-    "SelectConfig",
-    "Sight",
-    "Solver",
-    "View",
+    "Selection",
+    "Timing",
     "as_json",
+    "away_from_empty",
     "bin_content",
-    "bin_part",
     "bin_poses",
-    "crop_features",
-    "crop_for_draws",
-    "crop_pose",
+    "call_rows",
+    "candidates_of",
+    "canonical_pose",
+    "chosen",
+    "depth_agreement",
+    "depth_buffer",
     "detect",
+    "detections",
+    "device_calibration",
+    "device_part",
     "draw_of_crop",
     "expected_calibration_error",
+    "explore",
     "export_estimator",
-    "find_candidates",
-    "first_crop",
+    "find_poses_in_crop",
     "fit_calibration",
     "foreground",
-    "improved",
+    "gather_evidence",
+    "in_front_of_empty",
+    "inside_bin",
     "into",
+    "join",
     "load_probabilities",
     "make_scene",
+    "map_real",
+    "map_rows",
     "matches_of",
-    "padded_points",
+    "network_prediction",
+    "outline_agreement",
     "placed",
+    "poses_at",
+    "poses_in_crop",
     "poses_of_draw",
+    "predict",
     "probabilities_bytes",
     "refined",
+    "refined_candidates",
     "reliability",
-    "said_of_draw",
-    "search",
+    "same_place",
+    "search_at",
+    "search_crop",
     "search_draws",
+    "seed_crop",
     "seed_keys",
+    "seeds_at",
     "seeds_over",
     "select",
+    "select_poses",
     "spread_seeds",
     "surface_scores",
     "symmetry_transforms",
     "table",
-    "view_of",
     "write_bop_csv",
     "write_json",
 ]

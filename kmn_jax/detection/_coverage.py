@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from kmn_jax.detection._candidates import Candidates
 from kmn_jax.detection._frames import into
 from kmn_jax.detection._scene import Scene
+from kmn_jax.detection._search import Candidates
 from kmn_jax.errors import InputError
 from kmn_jax.objects import Part
 
@@ -58,33 +58,33 @@ def cover(
     scene: Scene,
     part: Part,
     found: Candidates,
-    score: Float[np.ndarray, " s"],
+    likely: Bool[np.ndarray, " s"],
     reach: float,
     config: CoverageConfig,
 ) -> Coverage:
-    """Return the state after a round; scores above zero are those of likely poses, farther apart than `reach`."""
+    """Return the state after a round; a likely pose is a new copy if none before it is nearer than `reach`."""
     from scipy.spatial import cKDTree
 
     rows = np.flatnonzero(before.left)
     away = before.away.copy()
-    distance, _ = cKDTree(np.asarray(found.searched.crops.seed)).query(scene.points[rows])
+    distance, _ = cKDTree(scene.points[found.seed_rows]).query(scene.points[rows])
     away[rows] = np.minimum(away[rows], distance)
 
-    centers = (found.T_view_object @ np.append((part.minimum + part.maximum) / 2, 1))[:, :3]
-    likely = _one_a_place(centers, score, reach)
+    centers = (found.T_camera_object @ np.append((part.minimum + part.maximum) / 2, 1))[:, :3]
+    likely = np.flatnonzero(likely)
     size = min(len(part.points), _SURFACE_POINTS)
     surface, near = cKDTree(part.points[:size]), config.explained * part.diameter + float(np.sqrt(part.area / size))
     for row in likely:
-        local = into(found.T_view_object[row].astype(np.float64), scene.points[rows])
+        local = into(found.T_camera_object[row].astype(np.float64), scene.points[rows])
         inside = np.flatnonzero(((local >= part.minimum - near) & (local <= part.maximum + near)).all(axis=1))
         distance, _ = surface.query(local[inside], distance_upper_bound=near)
         rows = np.delete(rows, inside[np.isfinite(distance)])
     left = np.zeros_like(before.left)
     left[rows] = True
 
-    new = [row for row in likely if (np.linalg.norm(before.places - centers[row], axis=1) > reach).all()]
-    places = np.concatenate([before.places, centers[new]])
-    return Coverage(left, away, places, 0 if new else before.barren + 1)
+    apart = np.linalg.norm(before.places[None] - centers[likely][:, None], axis=2)
+    new = (apart > reach).all(axis=1).any()
+    return Coverage(left, away, np.concatenate([before.places, centers[likely]]), 0 if new else before.barren + 1)
 
 
 def to_search(state: Coverage, scene: Scene, part: Part, config: CoverageConfig) -> Bool[np.ndarray, " r"]:
@@ -104,12 +104,3 @@ def _crowded(
     result = np.zeros_like(chosen)
     result[rows[counts[which.reshape(-1)] >= _LEAST_CROWD]] = True
     return result
-
-
-def _one_a_place(centers: Float[np.ndarray, "s 3"], score: Float[np.ndarray, " s"], reach: float) -> list[int]:
-    """Return rows of the best poses whose centres are apart; scores of zero do not count."""
-    chosen: list[int] = []
-    for row in np.argsort(-score, kind="stable")[: int((score > 0).sum())].tolist():
-        if (np.linalg.norm(centers[chosen] - centers[row], axis=1) > reach).all():
-            chosen.append(row)
-    return chosen

@@ -2,37 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from kmn_jax.detection._calibrate import Calibration, Probabilities
-from kmn_jax.detection._candidates import (
-    NUM_SEEDS,
-    CandidateConfig,
-    Candidates,
-    Solver,
-    crop_prediction,
-    find_candidates,
-    improved,
-    join,
-    seeds_at,
-    seeds_over,
-)
+from kmn_jax.detection._calibration import Calibration, Probabilities
+from kmn_jax.detection._canonical import canonical_pose
 from kmn_jax.detection._coverage import CoverageConfig, cover, nothing_covered, to_search
-from kmn_jax.detection._evidence import EVIDENCE
+from kmn_jax.detection._crop_search import CropPoses
+from kmn_jax.detection._device_part import DevicePart, device_part, same_place
+from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
 from kmn_jax.detection._frames import placed
+from kmn_jax.detection._mapping import call_rows
+from kmn_jax.detection._refinement import main_turns, refine_many, refine_one
 from kmn_jax.detection._result import Detection, Detections
 from kmn_jax.detection._scene import Scene
-from kmn_jax.detection._select import SelectConfig, Selection, same_place, select
+from kmn_jax.detection._search import Candidates, SearchConfig, crop_prediction, join, search_at, seed_keys
+from kmn_jax.detection._seeds import NUM_SEEDS, seeds_at, seeds_over
+from kmn_jax.detection._selection import Selection, select_poses
 from kmn_jax.detection._timing import Clock
 from kmn_jax.errors import InputError
 from kmn_jax.models import Model
-from kmn_jax.objects import Part, Symmetries
+from kmn_jax.objects import Part
 
 _SHARES = ("explained", "violated", "occluded", "unknown")
 _CLOSE_GAP = 0.05  # of probabilities
+_CONSIDERED = 128  # most probable poses that are compared with each other: one number, so one compilation
 _SYMMETRIC = "the part is symmetric: of the poses that look the same, this is the canonical one"
 _RIVALLED = "another pose in this place is nearly as probable: the part may lie the other way round"
 
@@ -41,17 +42,14 @@ _RIVALLED = "another pose in this place is nearly as probable: the part may lie 
 class DetectConfig:
     """How a scene is searched; lengths are shares of the object's diameter."""
 
-    candidates: CandidateConfig = field(default_factory=CandidateConfig)
+    search: SearchConfig = field(default_factory=SearchConfig)
     coverage: CoverageConfig = field(default_factory=CoverageConfig)
-    select: SelectConfig = field(default_factory=SelectConfig)
     later_seeds: int = 16  # at most in a round after the first; rounds go on until the foreground is covered
     most_seeds: int = 512  # at least so many are searched before it is given up to cover the foreground
     accepted: float = 0.5  # the probability from which on a pose explains points, and counts as found
     reported: float = 0.1  # less probable poses are left out
-    considered: int = 128  # most probable poses that are compared with each other
 
     def __post_init__(self) -> None:
-        """Refuse values that contradict their meaning."""
         if min(self.later_seeds, self.most_seeds) < 1 or not 0 <= self.reported <= self.accepted <= 1:
             raise InputError(
                 f"later_seeds = {self.later_seeds} and most_seeds = {self.most_seeds} must be at least 1, and reported"
@@ -67,129 +65,189 @@ def detect(
     probabilities: Probabilities,
     part: Part,
     scene: Scene,
-    seed: int,
+    random_seed: int,
     config: DetectConfig,
     at: Float[np.ndarray, "k 3"] | None = None,
-    solver: Solver | None = None,
     clock: Clock | None = None,
 ) -> Detections:
     """Return the copies of a part, whose lengths are in the scene's unit, in pick order.
 
-    With places `at`, in the view's frame, only these are searched. The same inputs and `seed` give the same bits on
-    one device.
+    With places `at`, in the camera's frame, each has one pose or none: that of the crop around the nearest point. The
+    same inputs and `random_seed` give the same bits on one device.
     """
     clock = clock or Clock()
+    search = replace(config.search, crops=config.search.crops.of_network(model.config))
+    on_device, warnings = device_part(model, part), scene.warnings
+    propose = partial(search_at, model, on_device, scene, random_seed=random_seed, config=search)
+    if at is not None:
+        with clock("search"):
+            found = propose(seeds_at(scene, at))
+            found = found._replace(usable=found.usable & found.is_first)
+        calibration = probabilities.found
+        with clock("selection"):
+            choice = chosen(found, calibration, on_device, config)
+    else:
+        found, more = explore(scene, part, propose, probabilities.found, config, clock)
+        warnings = (*warnings, *more)
+        with clock("selection"):
+            choice = chosen(found, probabilities.found, on_device, config)
+        calibration = probabilities.refined
+        if choice.kept.any():
+            with clock("refinement"):
+                rows = np.flatnonzero(choice.kept | choice.contenders)
+                found = refined_candidates(model, part, on_device, scene, found, rows, random_seed, search)
+            with clock("selection"):
+                choice = chosen(found, calibration, on_device, config)
+    with clock("report"):
+        poses = detections(found, choice, calibration, part, scene)
+    reason = None if poses else "; ".join(filter(None, (_reason(found, part), scene.doubt)))
+    return Detections(part.name, scene.unit, poses, clock.timing, reason, warnings)
+
+
+def explore(
+    scene: Scene,
+    part: Part,
+    propose: Callable[[Int[np.ndarray, " c"]], Candidates],
+    calibration: Calibration,
+    config: DetectConfig,
+    clock: Clock,
+) -> tuple[Candidates, tuple[str, ...]]:
+    """Return what is proposed around seeds, round by round until the foreground is covered, and warnings."""
     rounds: list[Candidates] = []
-    warnings, free, state = scene.warnings, scene.foreground, nothing_covered(scene)
+    warnings: tuple[str, ...] = ()
+    free, state, reach = scene.foreground, nothing_covered(scene), same_place(part)
     while True:
         with clock("search"):
-            most = config.later_seeds if rounds else NUM_SEEDS
-            seeds = seeds_over(scene, free, part, config.candidates, most) if at is None else seeds_at(scene, at)
-            rounds.append(find_candidates(model, part, scene, seeds, seed + len(rounds), config.candidates, solver))
-        if at is not None:
-            break
+            rounds.append(propose(seeds_over(scene, free, part, config.later_seeds if rounds else NUM_SEEDS)))
         with clock("coverage"):
-            last = rounds[-1]
-            probability = probabilities.found.probability(last.evidence)
-            likely = last.usable & (probability >= config.accepted)
-            score, reach = np.where(likely, probability, 0), same_place(part, config.select)
-            state = cover(state, scene, part, last, score, reach, config.coverage)
+            found = rounds[-1]
+            likely = found.usable & (calibration.probability(found.evidence) >= config.accepted)
+            state = cover(state, scene, part, found, likely, reach, config.coverage)
             free = to_search(state, scene, part, config.coverage)
         if not free.any():
             break
-        if sum(len(found.searched.rows) for found in rounds) >= config.most_seeds:
+        if sum(len(found.seed_rows) for found in rounds) >= config.most_seeds:
             left = free.sum() / scene.foreground.sum()
-            warnings = (*warnings, f"{left:.0%} of the foreground was not searched: narrow it down to where parts are")
+            warnings = (f"{left:.0%} of the foreground was not searched: narrow it down to where parts are",)
             break
-    with clock("selection"):
-        joined = join(rounds)
-        choice = _selected(joined, probabilities.found, part, config)
-    if choice.kept.any():
-        with clock("refinement"):
-            rows = np.flatnonzero(choice.kept | choice.contenders)
-            joined = improved(model, part, scene, joined, rows, seed, config.candidates)
-        with clock("selection"):
-            choice = _selected(joined, probabilities.refined, part, config)
-    with clock("report"):
-        probability = probabilities.refined.probability(joined.evidence)
-        found = [
-            _detection(row, float(probability[row]), float(choice.gap[row]), joined, part, scene)
-            for row in np.flatnonzero(choice.kept).tolist()
-        ]
-        found.sort(key=lambda pose: -pose.probability * pose.visible_fraction)
-    reason = None if found else "; ".join(filter(None, (_reason(joined, part), scene.doubt)))
-    return Detections(part.name, scene.unit, tuple(found), clock.timing, reason, warnings)
+    return join(rounds), warnings
 
 
-def _selected(found: Candidates, calibration: Calibration, part: Part, config: DetectConfig) -> Selection:
+def refined_candidates(
+    model: Model,
+    part: Part,
+    on_device: DevicePart,
+    scene: Scene,
+    found: Candidates,
+    rows: Int[np.ndarray, " k"],
+    random_seed: int,
+    config: SearchConfig,
+) -> Candidates:
+    """Return some of the candidates refined on all points around them, and turned forms of them that fit as well.
+
+    The first k are the candidates themselves; all have evidence of their own.
+    """
+    turns, is_rival = (jnp.asarray(array) for array in main_turns(part))
+    given = (
+        scene.cloud,
+        on_device.surfels,
+        turns,
+        is_rival,
+        on_device.arrays.diameter,
+        scene.image,
+        config.crops.smooth,
+        config.agreement,
+    )
+    seeds = found.seed_rows[found.crop[rows]]
+    poses, there = call_rows(
+        lambda pose, row, key: refine_one(pose, row, key, *given),
+        lambda poses, rows, keys: refine_many(poses, rows, keys, *given),
+        found.T_camera_object[rows],
+        seeds.astype(np.int32),
+        seed_keys(seeds, random_seed),
+    )
+    # The refined forms take the place of the poses of their crops.
+    forms = there.shape[1]
+    own = jax.tree.map(
+        lambda leaf: np.repeat(leaf.reshape(-1, *leaf.shape[2:])[rows, None], forms, axis=1),
+        (found.found.poses, found.found.scores),
+    )
+    wide = own[0]._replace(T_scene_object=poses, converged=there)
+    crops: CropPoses = jax.tree.map(lambda leaf: leaf[found.crop[rows]], found.found)
+    crops = crops._replace(poses=wide, scores=own[1])
+    agreement = config.agreement
+
+    def proof(crops: CropPoses) -> Float[jax.Array, "a f"]:
+        return gather_evidence(crops, on_device.arrays, on_device.surfels, scene.image, agreement)
+
+    evidence = call_rows(proof, jax.vmap(proof), crops)
+    return Candidates(
+        _forms_first(poses),
+        _forms_first(there),
+        _forms_first(evidence),
+        _forms_first(wide.num_inliers),
+        np.tile(found.crop[rows], forms),
+        found.found,
+        found.seed_rows,
+    )
+
+
+def _forms_first(leaf: Any) -> np.ndarray:
+    """Return rows of forms (k, a, ...) one form after the other, (a * k, ...)."""
+    return np.swapaxes(leaf, 0, 1).reshape(-1, *leaf.shape[2:])
+
+
+def chosen(found: Candidates, calibration: Calibration, part: DevicePart, config: DetectConfig) -> Selection:
     """Choose among the most probable candidates."""
     probability = calibration.probability(found.evidence)
     possible = found.usable & (probability >= config.reported)
-    ranked = np.argsort(-np.where(possible, probability, -1), kind="stable")[: config.considered]
-    few = np.zeros_like(possible)
-    few[ranked] = possible[ranked]
-    return select(found.T_view_object, probability, few, part, config.select)
+    ranked = np.argsort(-np.where(possible, probability, -1), kind="stable")[:_CONSIDERED]
+    rows = np.pad(ranked, (0, _CONSIDERED - len(ranked)), mode="edge")
+    usable = possible[rows] & (np.arange(_CONSIDERED) < len(ranked))
+    poses = found.T_camera_object[rows]
+    few: Selection = jax.device_get(select_poses(poses, probability[rows].astype(np.float32), usable, part))
+
+    def of_all(values: Any) -> Any:
+        result = np.zeros(len(possible), dtype=values.dtype)
+        result[ranked] = values[: len(ranked)]
+        return result
+
+    return Selection(*map(of_all, few))
+
+
+def detections(
+    found: Candidates, choice: Selection, calibration: Calibration, part: Part, scene: Scene
+) -> tuple[Detection, ...]:
+    """Return the poses that stand as plain records in the scene's frame, in pick order."""
+    probability = calibration.probability(found.evidence)
+    poses = [
+        _detection(row, float(probability[row]), float(choice.gap[row]), found, part, scene)
+        for row in np.flatnonzero(choice.kept).tolist()
+    ]
+    return tuple(sorted(poses, key=lambda pose: -pose.probability * pose.visible_fraction))
 
 
 def _detection(row: int, probability: float, gap: float, found: Candidates, part: Part, scene: Scene) -> Detection:
-    T_scene_view = scene.view.T_scene_view
-    pose = T_scene_view @ found.T_view_object[row].astype(np.float64)
-    pose = canonical_pose(pose, part.symmetries)
+    pose = canonical_pose(scene.T_scene_camera @ found.T_camera_object[row].astype(np.float64), part.symmetries)
     shares = {name: float(found.evidence[row, EVIDENCE.index(name)]) for name in _SHARES}
     prediction = crop_prediction(found, row)
+    notes = ((_SYMMETRIC, part.is_symmetric), (_RIVALLED, gap < _CLOSE_GAP))
     return Detection(
         T_scene_object=pose,
         probability=probability,
         num_inliers=int(found.num_inliers[row]),
         visible_fraction=1 - shares["occluded"],
         runner_up_gap=gap,
-        seed=placed(T_scene_view, np.asarray(found.searched.crops.seed[found.crop[row]])),
-        prediction=replace(prediction, points=placed(T_scene_view, prediction.points).astype(np.float32)),
-        warnings=tuple(
-            text for text, holds in ((_SYMMETRIC, part.is_symmetric), (_RIVALLED, gap < _CLOSE_GAP)) if holds
-        ),
+        seed=placed(scene.T_scene_camera, np.asarray(found.found.seed[found.crop[row]])),
+        prediction=replace(prediction, points=placed(scene.T_scene_camera, prediction.points).astype(np.float32)),
+        warnings=tuple(text for text, holds in notes if holds),
         **shares,
     )
-
-
-def canonical_pose(T_scene_object: Float[np.ndarray, "4 4"], symmetries: Symmetries) -> Float[np.ndarray, "4 4"]:
-    """Return, of the poses that look the same, the one whose axes are nearest to the scene's, as a proper rigid pose.
-
-    Nearest means the largest trace of the rotation; continuous symmetries are turned to it exactly.
-    """
-    rotation = _orthonormal(T_scene_object[:3, :3])
-    forms = [rotation @ other for other in symmetries.rotations]
-    for axis in symmetries.axes:
-        forms = [_turned_to_identity(form, axis) for form in forms]
-    best = max(range(len(forms)), key=lambda row: (round(float(np.trace(forms[row])), 6), -row))
-    result = np.eye(4)
-    result[:3, :3] = forms[best]
-    # The symmetry's centre stays where it is.
-    place = rotation @ symmetries.center + T_scene_object[:3, 3]
-    result[:3, 3] = place - forms[best] @ symmetries.center
-    return result
-
-
-def _turned_to_identity(rotation: Float[np.ndarray, "3 3"], axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation followed, in the object's frame, by the turn about an axis that makes its trace largest."""
-    cross = np.cross(np.eye(3), axis)  # the matrix of the product with the axis, up to its sign
-    outer = np.outer(axis, axis)
-    cosine = float(np.trace(rotation) - axis @ rotation @ axis)
-    sine = float(np.trace(rotation @ cross.T))
-    angle = np.arctan2(sine, cosine)
-    turn = outer + np.cos(angle) * (np.eye(3) - outer) + np.sin(angle) * cross.T
-    return rotation @ turn
-
-
-def _orthonormal(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """Return the nearest rotation: float32 leaves errors of 1e-6."""
-    left, _, right = np.linalg.svd(rotation)
-    return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
 
 
 def _reason(found: Candidates, part: Part) -> str:
     """Say why nothing is reported."""
     if not found.usable.any():
-        places = len(np.unique(found.searched.rows))
+        places = len(np.unique(found.seed_rows))
         return f"no pose of {part.name} agrees with any of the {places} places that were searched"
     return f"none of the {int(found.usable.sum())} poses that were found is probable: {part.name} may not be there"

@@ -8,20 +8,19 @@ from pathlib import Path
 from typing import Any, TypeAlias, overload
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from kmn_jax.bop import bop_scan, is_bop_image
-from kmn_jax.detection._calibrate import Probabilities, load_probabilities
+from kmn_jax.bop import bop_scan, bop_scene_id, bop_sizes, is_bop_image
+from kmn_jax.detection._calibration import Probabilities, load_probabilities
 from kmn_jax.detection._detect import DetectConfig, detect
 from kmn_jax.detection._evidence import EVIDENCE
-from kmn_jax.detection._foreground import ForegroundOptions, foreground
+from kmn_jax.detection._foreground import ForegroundOptions
 from kmn_jax.detection._frames import into
 from kmn_jax.detection._result import Detections
 from kmn_jax.detection._scene import Scene, make_scene, nearest_row
 from kmn_jax.detection._timing import Clock
-from kmn_jax.detection._view import View, view_of
 from kmn_jax.errors import InputError, float_array
-from kmn_jax.io import Scan, length_doubt, length_problem, read_scan, scene_size
+from kmn_jax.io import Scan, length_doubt, length_problem, read_scan, resolve_unit, scene_size
 from kmn_jax.models import Model, load_model, released_file
 from kmn_jax.objects import (
     ObjectConfig,
@@ -42,7 +41,8 @@ ScanSource: TypeAlias = str | Path | np.ndarray | Scan
 _UNFITTED = "the probabilities were fitted for other weights: fit them with experiments.calibrate"
 _NUM_POINTS = 4096  # on a part's surface
 _CARD = ".kmn"
-_SEEDS = 2**31 - 2**16  # rounds of a search count on from the seed
+_MOST_SEED = 2**31 - 1
+_SAME_SIZE = 0.03  # between the lengths of a part and of the same one in a dataset
 
 
 @dataclass(frozen=True)
@@ -92,60 +92,101 @@ class PoseEstimator:
     def scene(
         self,
         scan: ScanSource,
-        part: Part,
+        part: Part | Sequence[Part],
         *,
         unit: str | None = None,
         camera: str | Path | None = None,
         sensor: Float[np.ndarray, "3"] | None = None,
-        at: Float[np.ndarray, "k 3"] | None = None,
+        at: Float[np.ndarray, "*k 3"] | None = None,
         background: ForegroundOptions | None = None,
     ) -> Scene:
-        """Make a scan ready for searches of a part, or of several of about its size.
+        """Make a scan ready for searches of a part, or of several: `detect` does so itself, this is for many calls.
 
-        `scan` is a file, points (n, 3) in the sensor's frame or a `Scan`; `unit` is that of its lengths, by default
-        the part's. An image of a BOP dataset needs neither it nor a camera. `sensor` is where it was measured from, by
-        default the origin, and points nearest to places `at` are kept whatever is thinned out, both in the scan's
-        frame. Raises InputError if lengths of part and scan cannot belong together, or if nothing of the scan is
-        foreground.
+        See `detect` for the arguments.
         """
-        read = _scan(scan, unit or part.unit, camera)
+        parts = sorted([part] if isinstance(part, Part) else part, key=lambda one: one.in_unit("m").diameter)
+        if not parts:
+            raise InputError("no part is given to make the scene for")
+        smallest, ratio = parts[0], parts[-1].in_unit("m").diameter / parts[0].in_unit("m").diameter
+        read, truth, bop_ids = _read(scan, unit, camera, smallest)
         size = scene_size(read)
-        problem = length_problem(part.diameter, part.unit, size)
+        problem = length_problem(smallest.diameter, smallest.unit, size)
         if problem is not None:
             raise InputError(problem)
-        if sensor is not None and read.camera is not None:
-            raise InputError("a depth image is in the frame of its sensor: leave the sensor's place out")
-        view = view_of(read, sensor)
-        diameter = part.in_unit(read.unit).diameter
-        front, warnings = _foreground(read, view, diameter, background or ForegroundOptions())
-        places = None if at is None else into(view.T_scene_view, at)
-        most = self.config.candidates.most_points
-        scene = make_scene(view, read.unit, front, most, places, (*self.warnings, *warnings))
-        return replace(scene, doubt=length_doubt(part.diameter, part.unit, size))
+        options = background or ForegroundOptions()
+        # Margins are those of the smallest part, but a plane is background only if it is no part's.
+        options = replace(options, least_extent=options.least_extent * ratio)
+        diameter = smallest.in_unit(read.unit).diameter
+        scene = make_scene(read, diameter, sensor=sensor, background=options, keep=_places(at))
+        return replace(
+            scene,
+            warnings=(*self.warnings, *scene.warnings),
+            doubt=length_doubt(smallest.diameter, smallest.unit, size),
+            truth=truth,
+            bop_ids=bop_ids,
+        )
+
+    def read(self, scan: ScanSource, part: Part, unit: str | None = None, camera: str | Path | None = None) -> Scan:
+        """Read a scan as `scene` does, such as that of an empty bin."""
+        return _read(scan, unit, camera, part)[0]
 
     @overload
-    def detect(self, part: Part, scan: ScanSource | Scene, **options: Any) -> Detections: ...
+    def detect(
+        self,
+        part: Part,
+        scan: ScanSource | Scene,
+        camera: str | Path | None = None,
+        unit: str | None = None,
+        at: Float[np.ndarray, "*k 3"] | None = None,
+        *,
+        sensor: Float[np.ndarray, "3"] | None = None,
+        background: ForegroundOptions | None = None,
+        random_seed: int = 0,
+        top: int | None = None,
+        clock: Clock | None = None,
+    ) -> Detections: ...
 
     @overload
-    def detect(self, part: Sequence[Part], scan: ScanSource | Scene, **options: Any) -> tuple[Detections, ...]: ...
+    def detect(
+        self,
+        part: Sequence[Part],
+        scan: ScanSource | Scene,
+        camera: str | Path | None = None,
+        unit: str | None = None,
+        at: Float[np.ndarray, "*k 3"] | None = None,
+        *,
+        sensor: Float[np.ndarray, "3"] | None = None,
+        background: ForegroundOptions | None = None,
+        random_seed: int = 0,
+        top: int | None = None,
+        clock: Clock | None = None,
+    ) -> tuple[Detections, ...]: ...
 
     def detect(
         self,
         part: Part | Sequence[Part],
         scan: ScanSource | Scene,
-        *,
-        seed: int = 0,
+        camera: str | Path | None = None,
+        unit: str | None = None,
         at: Float[np.ndarray, "*k 3"] | None = None,
+        *,
+        sensor: Float[np.ndarray, "3"] | None = None,
+        background: ForegroundOptions | None = None,
+        random_seed: int = 0,
         top: int | None = None,
         clock: Clock | None = None,
-        **options: Any,
     ) -> Detections | tuple[Detections, ...]:
         """Return the copies of a part in a scan, in pick order; of several parts, one result for each.
 
-        Several parts share the scene, and where their diameters agree the features of its crops. `at` restricts the
-        search to places (k, 3) in the scan's frame, `top` the result to the first poses; `options` go to `scene`
-        unless the scan is one already. `clock` has timed what came before. The same inputs and `seed` give the same
-        bits on one device.
+        `scan` is a file, points (n, 3) in the sensor's frame, a `Scan`, or a `Scene` that was made of one; then what
+        says how to read it is not given again. `unit` is that of its lengths, by default what its format states, else
+        the part's; an image of a BOP dataset needs neither it nor a camera. `at` restricts the search to places (k, 3)
+        in the scan's frame: each has one pose or none. `sensor` is where the scan was measured from, by default the
+        origin of its frame; `background` says what is no part; `top` keeps the first poses only; `clock` has timed what
+        came before. The same inputs and `random_seed` give the same bits on one device.
+
+        Raises InputError if lengths of part and scan cannot belong together, if nothing of the scan is foreground, or
+        if nothing was measured near to one of the places.
         """
         parts = [part] if isinstance(part, Part) else list(part)
         if not parts:
@@ -153,24 +194,22 @@ class PoseEstimator:
         for one in parts:
             if one.model_digest != self.digest:
                 raise InputError(f"the part {one.name} was prepared with other weights: prepare it with this estimator")
-        if not 0 <= seed < _SEEDS:
-            raise InputError(f"seed is {seed}, but must be between 0 and {_SEEDS - 1}")
+        if not 0 <= random_seed <= _MOST_SEED:
+            raise InputError(f"random_seed is {random_seed}, but must be between 0 and {_MOST_SEED}")
         clock = clock or Clock()
-        places = None if at is None else np.asarray(float_array(np.atleast_2d(at), "at", (None, 3)), dtype=float)
+        places = _places(at)
         if isinstance(scan, Scene):
+            if (camera, unit, sensor, background) != (None, None, None, None):
+                raise InputError("camera, unit, sensor and background were settled when the scene was made")
             scene = scan
         else:
             with clock("scene"):
-                smallest, *_, largest = sorted((*parts, parts[0]), key=lambda one: one.in_unit("m").diameter)
-                ratio = largest.in_unit("m").diameter / smallest.in_unit("m").diameter
-                planes = options.pop("background", None) or ForegroundOptions()
-                # Margins are those of the smallest part, but a plane is background only if it is no part's.
-                planes = replace(planes, least_extent=planes.least_extent * ratio)
-                scene = self.scene(scan, smallest, at=places, background=planes, **options)
-        in_view = None if places is None else into(scene.view.T_scene_view, places)
-        if in_view is not None:
-            reach = max(one.in_unit(scene.unit).diameter for one in parts)
-            _check_near(scene, in_view, reach)
+                scene = self.scene(
+                    scan, parts, unit=unit, camera=camera, sensor=sensor, at=places, background=background
+                )
+        if places is not None:
+            places = into(scene.T_scene_camera, places)
+            _check_near(scene, places, max(one.in_unit(scene.unit).diameter for one in parts))
         results = []
         for one in parts:
             found = detect(
@@ -178,42 +217,22 @@ class PoseEstimator:
                 self.probabilities,
                 one.in_unit(scene.unit),
                 scene,
-                seed,
+                random_seed,
                 self.config,
-                in_view,
-                clock=clock,
+                places,
+                clock,
             )
             results.append(replace(found, poses=found.poses[:top]))
             clock = Clock()
         return results[0] if isinstance(part, Part) else tuple(results)
 
-    def estimate(
-        self,
-        part: Part,
-        crop: Float[np.ndarray, "_ 3"] | Sequence[Float[np.ndarray, "_ 3"]],
-        *,
-        seed: int = 0,
-        unit: str | None = None,
-    ) -> Detections | tuple[Detections, ...]:
-        """Return the pose of the copy in the middle of a crop, its first point; of several crops, one result each.
 
-        A crop is points (n, 3) in the sensor's frame around a picked point, which is its first row; more than a
-        diameter away from it they are not used. There is one pose or none.
-        """
-        single = isinstance(crop, np.ndarray) and crop.ndim == 2
-        crops = [crop] if single else list(crop)
-        keep_all = ForegroundOptions(remove_plane="never")
-        results = []
-        for points in crops:
-            points = np.asarray(float_array(points, "crop", (None, 3)), dtype=np.float32)
-            if not len(points):
-                raise InputError("crop is empty: at least one point is needed")
-            results.append(self.detect(part, points, seed=seed, at=points[:1], top=1, unit=unit, background=keep_all))
-        return results[0] if single else tuple(results)
+def _places(at: Float[np.ndarray, "*k 3"] | None) -> Float[np.ndarray, "k 3"] | None:
+    return None if at is None else np.asarray(float_array(np.atleast_2d(at), "at", (None, 3)), dtype=float)
 
 
 def _check_near(scene: Scene, places: Float[np.ndarray, "k 3"], reach: float) -> None:
-    """Raise InputError if nothing was measured near to one of the places, which are in the view's frame."""
+    """Raise InputError if nothing was measured near to one of the places, which are in the camera's frame."""
     for number, place in enumerate(places):
         away = float(np.linalg.norm(scene.points[nearest_row(scene.points, place)] - place))
         if away > reach:
@@ -223,37 +242,33 @@ def _check_near(scene: Scene, places: Float[np.ndarray, "k 3"], reach: float) ->
             )
 
 
-def _foreground(
-    scan: Scan, view: View, diameter: float, options: ForegroundOptions
-) -> tuple[Bool[np.ndarray, " n"], tuple[str, ...]]:
-    """Return which points of a view are foreground; planes and what is behind them are as its sensor saw them."""
-    if len(view.rows) == len(scan.points) and np.array_equal(view.T_scene_view, np.eye(4)):
-        return foreground(scan, diameter, options)
-    region = replace(options, background=None, remove_plane="never")
-    inside, _ = foreground(scan, diameter, region)
-    empty = options.background
-    if empty is not None:
-        empty = replace(empty, points=into(view.T_scene_view, empty.points).astype(np.float32), depth=None)
-    rows = np.flatnonzero(inside[view.rows])
-    seen = Scan(view.points[rows], None, None, None, scan.unit)
-    front, warnings = foreground(seen, diameter, replace(options, roi=None, background=empty))
-    result = np.zeros(len(view.points), dtype=bool)
-    result[rows[front]] = True
-    return result, warnings
-
-
-def _scan(source: ScanSource, unit: str, camera: str | Path | None) -> Scan:
+def _read(
+    source: ScanSource, unit: str | None, camera: str | Path | None, part: Part
+) -> tuple[Scan, tuple[Float[np.ndarray, "4 4"], ...] | None, tuple[int, int, int]]:
+    """Return a scan; of an image of a BOP dataset also the true poses of a part, if known, and what it is called."""
+    nothing, asked = (0, 0, 1), unit or "auto"
     if isinstance(source, Scan):
-        return source
+        return source, None, nothing
     if isinstance(source, str | Path):
-        if camera is None and is_bop_image(source):
-            return bop_scan(source)[0]
-        return read_scan(source, unit, camera)
+        path = Path(source)
+        if camera is not None or not is_bop_image(path):
+            return read_scan(path, resolve_unit(asked, part.unit), camera), None, nothing
+        scan, instances = bop_scan(path, resolve_unit(asked, part.unit, "mm"))
+        inside, sizes = part.in_unit("mm"), bop_sizes(path)
+        own = (inside.diameter, *np.sort(inside.maximum - inside.minimum))
+        # A dataset's object of another size is not the part; of several that may be, none is known to be.
+        objects = {instance.object_id for instance in instances or ()}
+        alike = [number for number in objects if np.allclose(sizes.get(number, own), own, rtol=_SAME_SIZE)]
+        ids = (bop_scene_id(path), int(path.stem), alike[0] if len(alike) == 1 else 1)
+        if len(alike) != 1:
+            return scan, None, ids
+        copies = [instance for instance in instances or () if instance.object_id == alike[0]]
+        return scan, tuple(instance.T_camera_object for instance in copies), ids
     array = np.asarray(float_array(source, "scan", (None, 3), finite=False), dtype=np.float32)
     real = np.isfinite(array).all(axis=1) & (array != 0).any(axis=1)
     if not real.any():
         raise InputError(f"none of the scan's {len(array)} points was measured: all are NaN, infinite or zero")
-    return Scan(array[real], None, None, None, check_unit(unit))
+    return Scan(array[real], None, None, None, resolve_unit(asked, part.unit)), None, nothing
 
 
 def _object(source: PartSource, unit: str | None, name: str | None) -> ObjectModel:

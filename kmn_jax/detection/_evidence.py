@@ -1,23 +1,26 @@
-"""What speaks for and against a pose: what the depth image shows of it, and what the network says of its crop."""
+"""What speaks for and against a pose: what the crop and the depth image show of it, and what the network says."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from kmn_jax.detection._contour import contour
-from kmn_jax.detection._search import CropFeatures, Hypotheses, Predictions, each
-from kmn_jax.detection._verify import VerifyConfig, agreement
-from kmn_jax.geometry import Intrinsics, inverse, nearest, transform_points
+from kmn_jax.detection._crop_search import CropPoses, Prediction
+from kmn_jax.detection._depth_agreement import DepthAgreementConfig, DepthImage, depth_agreement
+from kmn_jax.detection._mapping import map_real
+from kmn_jax.detection._outline import outline_agreement
+from kmn_jax.geometry import inverse, nearest, transform_points
 from kmn_jax.objects import PartArrays
+from kmn_jax.pose import PoseResult
 from kmn_jax.simulate import Surfels
 from kmn_jax.typing import Scalar
 
 EVIDENCE = (
-    "explained",  # of the picture area of the pose, see `Agreement`
+    "surface",  # score of the crop's points, see `CropPoses`; of a refined pose that of the pose that it was made of
+    "explained",  # of the picture area of the pose, see `DepthAgreement`
     "violated",
     "occluded",
     "unknown",
@@ -32,7 +35,7 @@ EVIDENCE = (
     "covered",  # share of the crop's points on the pose's surface that are on the object
     "certainty",  # mean probability of the likeliest keypoint
     "object_share",  # of the crop's points that are on the object
-    "open",  # share of the pose's outline, see `Contour`
+    "open",  # share of the pose's outline, see `OutlineAgreement`
     "level",
     "open_explained",  # products: an explained pose and a hidden one end differently
     "open_occluded",
@@ -45,64 +48,57 @@ _SURFACE = 0.05  # diameters; points so near to a surface with a normal like it 
 _ALIKE = 0.5  # cosine
 
 
-class Sight(NamedTuple):
-    """A depth image, zero where nothing was measured, and its camera."""
+def evidence_on(
+    found: CropPoses, part: PartArrays, surfels: Surfels, image: DepthImage, config: DepthAgreementConfig
+) -> Float[Array, "h f"]:
+    """Return the evidence on each pose of a crop, in the order of EVIDENCE; zeros where there is none."""
+    prediction = found.prediction
+    keypoint_scores = jax.nn.softmax(prediction.logits, axis=1)
 
-    depth: Float[Array, "h w"]
-    camera: Intrinsics
+    def of_pose(pose: PoseResult, score: Scalar) -> Float[Array, " f"]:
+        return _evidence(pose, score, prediction, keypoint_scores, found.seed, part, surfels, image, config)
 
-
-def evidence_of(
-    found: Hypotheses,
-    said: Predictions,
-    crops: CropFeatures,
-    part: PartArrays,
-    surfels: Surfels,
-    sight: Sight,
-    config: VerifyConfig,
-) -> Float[Array, "s h f"]:
-    """Return the evidence on each pose, in the order of EVIDENCE; zeros for crops without any pose."""
-
-    def of_crop(found: Hypotheses, said: Predictions, crop: CropFeatures) -> Float[Array, "h f"]:
-        return jax.lax.map(lambda pose: _evidence(pose, said, crop, part, surfels, sight, config), found)
-
-    return each(of_crop, crops.valid & found.found.any(axis=1), found, said, crops)
+    return map_real(of_pose, found.poses.converged, found.poses, found.scores)
 
 
 def _evidence(
-    found: Hypotheses,
-    said: Predictions,
-    crop: CropFeatures,
+    found: PoseResult,
+    score: Scalar,
+    prediction: Prediction,
+    keypoint_scores: Float[Array, "n k"],
+    seed: Float[Array, "3"],
     part: PartArrays,
     surfels: Surfels,
-    sight: Sight,
-    config: VerifyConfig,
+    image: DepthImage,
+    config: DepthAgreementConfig,
 ) -> Float[Array, " f"]:
-    outline = contour(found.T_scene_object, surfels, sight.depth, sight.camera, part.diameter, config)
-    seen = agreement(found.T_scene_object, surfels, sight.depth, sight.camera, part.diameter, config)
-    local = transform_points(inverse(found.T_scene_object), crop.points + crop.seed[None])
-    label, _ = nearest(local, part.points[: said.scores.shape[1]])
+    pose, on_object = found.T_scene_object, prediction.on_object
+    outline = outline_agreement(pose, surfels, image, part.diameter, config)
+    seen = depth_agreement(pose, surfels, image, part.diameter, config)
+    local = transform_points(inverse(pose), prediction.points + seed[None])
+    label, _ = nearest(local, part.points[: keypoint_scores.shape[1]])
     row, distance = nearest(local, part.points)
-    normals = jnp.matmul(crop.normals, found.T_scene_object[:3, :3], precision=jax.lax.Precision.HIGHEST)
+    normals = jnp.matmul(prediction.normals, pose[:3, :3], precision=jax.lax.Precision.HIGHEST)
     cosine = (normals * part.normals[row]).sum(axis=1)
     distance = distance / part.diameter
-    near = said.on_object & (distance <= _NEAR)
-    surface = crop.mask & (distance <= _SURFACE) & (cosine > _ALIKE)
+    near = on_object & (distance <= _NEAR)
+    surface = prediction.mask & (distance <= _SURFACE) & (cosine > _ALIKE)
     columns = {
+        "surface": score,
         **seen._asdict(),
         **outline._asdict(),
         "open_explained": outline.open * seen.explained,
         "open_occluded": outline.open * seen.occluded,
         "confirmed": seen.explained / jnp.maximum(seen.explained + seen.violated, 1e-6),
-        "fit": _mean(near, said.on_object),
+        "fit": _mean(near, on_object),
         "rms_error": jnp.where(near.any(), jnp.sqrt(_mean(distance**2, near)), _NEAR),
-        "inlier_share": found.inlier_share,
+        "inlier_share": found.score,
         "log_inliers": jnp.log1p(found.num_inliers.astype(jnp.float32)),
-        "likelihood": _mean(jnp.take_along_axis(said.scores, label[:, None], axis=1)[:, 0], said.on_object),
-        "straight": _mean(cosine, said.on_object & (distance <= _SURFACE)),
-        "covered": _mean(said.on_object, surface),
-        "certainty": _mean(said.scores.max(axis=1), said.on_object),
-        "object_share": _mean(said.on_object, crop.mask),
+        "likelihood": _mean(jnp.take_along_axis(keypoint_scores, label[:, None], axis=1)[:, 0], on_object),
+        "straight": _mean(cosine, on_object & (distance <= _SURFACE)),
+        "covered": _mean(on_object, surface),
+        "certainty": _mean(keypoint_scores.max(axis=1), on_object),
+        "object_share": _mean(on_object, prediction.mask),
     }
     return jnp.stack([columns[name] for name in EVIDENCE])
 
@@ -111,3 +107,6 @@ def _mean(values: Array, where: Bool[Array, " n"]) -> Scalar:
     """Return the mean over some rows, zero of none."""
     chosen = jnp.where(where, values.astype(jnp.float32), 0)
     return chosen.sum() / jnp.maximum(where.sum(dtype=jnp.int32), 1).astype(jnp.float32)
+
+
+gather_evidence = partial(jax.jit, static_argnames="config")(evidence_on)

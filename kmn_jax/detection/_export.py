@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -10,16 +11,15 @@ import jax.numpy as jnp
 from jax import export as jax_export
 from jaxtyping import Array, Bool, Float, UInt32
 
-from kmn_jax.detection._bin_poses import BinPosesConfig, bin_part, poses_in_scene
-from kmn_jax.detection._candidates import NUM_SEEDS
+from kmn_jax.detection._bin_program import BinPosesConfig, device_calibration, poses_in_cloud
+from kmn_jax.detection._depth_agreement import DepthImage, depth_buffer
+from kmn_jax.detection._device_part import device_part
 from kmn_jax.detection._estimator import PoseEstimator
-from kmn_jax.detection._evidence import Sight
-from kmn_jax.detection._scan_crop import SceneArrays
 from kmn_jax.detection._scene import LEAST_POINTS
-from kmn_jax.detection._verify import depth_buffer
+from kmn_jax.detection._seeds import NUM_SEEDS
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
-from kmn_jax.geometry import Intrinsics
+from kmn_jax.geometry import Intrinsics, PaddedCloud
 from kmn_jax.objects import Part
 
 PLATFORMS = ("cpu", "cuda")
@@ -52,18 +52,17 @@ def export_estimator(estimator: PoseEstimator, part: Part, path: str | Path, num
 
 def _program(estimator: PoseEstimator, part: Part) -> Callable[..., dict[str, Array]]:
     """Return the search as a function of arrays only; all else is part of the program."""
-    model, found = estimator.model, estimator.config
-    own = found.candidates
-    config = BinPosesConfig(NUM_SEEDS, search=own.search, verify=own.verify, select=found.select)
-    on_device = bin_part(model, part, estimator.probabilities.found, config)
+    model, search = estimator.model, estimator.config.search
+    config = BinPosesConfig(NUM_SEEDS, search=replace(search, crops=search.crops.of_network(model.config)))
+    on_device, calibration = device_part(model, part), device_calibration(estimator.probabilities.found)
 
     def program(points: Float[Array, "r 3"], mask: Bool[Array, " r"], key: UInt32[Array, " 2"]) -> dict[str, Array]:
         mask = mask & jnp.isfinite(points).all(axis=1) & (points[:, 2] > 0)
-        scene = SceneArrays(jnp.where(mask[:, None], points, 0), mask)
-        camera = _fitting_camera(scene)
-        sight = Sight(depth_buffer(scene.points, mask, camera, (_SIDE, _SIDE)), camera)
+        cloud = PaddedCloud(jnp.where(mask[:, None], points, 0), mask)
+        camera = _fitting_camera(cloud)
+        image = DepthImage(depth_buffer(cloud.points, mask, camera, (_SIDE, _SIDE)), camera)
         key = jax.random.wrap_key_data(key)
-        poses = poses_in_scene(*model, on_device, scene, mask, sight, key, model.config.num_scene_points, config)
+        poses = poses_in_cloud(*model, on_device, calibration, cloud, mask, image, key, config)
         return {
             "T_scene_object": poses.T_camera_object,
             "probability": poses.probability,
@@ -74,13 +73,13 @@ def _program(estimator: PoseEstimator, part: Part) -> Callable[..., dict[str, Ar
     return program
 
 
-def _fitting_camera(scene: SceneArrays) -> Intrinsics:
+def _fitting_camera(cloud: PaddedCloud) -> Intrinsics:
     """Return a camera at the sensor that sees all points."""
-    depth = jnp.where(scene.mask, scene.points[:, 2], 1)
-    directions = scene.points[:, :2] / depth[:, None]
-    low = jnp.where(scene.mask[:, None], directions, jnp.inf).min(axis=0)
-    high = jnp.where(scene.mask[:, None], directions, -jnp.inf).max(axis=0)
-    some = scene.mask.any()
+    depth = jnp.where(cloud.mask, cloud.points[:, 2], 1)
+    directions = cloud.points[:, :2] / depth[:, None]
+    low = jnp.where(cloud.mask[:, None], directions, jnp.inf).min(axis=0)
+    high = jnp.where(cloud.mask[:, None], directions, -jnp.inf).max(axis=0)
+    some = cloud.mask.any()
     low, high = jnp.where(some, low, 0), jnp.where(some, high, 1)
     focal = (_SIDE - 2) / jnp.maximum((high - low).max(), 1e-3)
     side = jnp.float32(_SIDE)

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float, Float32
 
 from kmn_jax.detection._background import away_from_empty, in_front_of_empty
+from kmn_jax.detection._frames import into, placed
 from kmn_jax.detection._planes import Plane, dominant_plane, extent
 from kmn_jax.detection._walls import Ground, off_walls
 from kmn_jax.errors import InputError
@@ -39,13 +40,13 @@ class ForegroundOptions:
     """
 
     background: Scan | None = None  # the empty bin, in the same frame
-    roi: Box | None = None  # xmin, ymin, zmin, xmax, ymax, zmax in the scene's frame and unit: only that is looked at
+    roi: Box | None = None  # xmin, ymin, zmin, xmax, ymax, zmax in the scene's frame and unit: nothing else is searched
     remove_plane: RemovePlane = "auto"
     background_margin: float = 0.05  # nearer than that to the empty bin is background
     plane_margin: float = 0.03  # nearer than that to the plane belongs to it
     least_share: float = 0.2  # of the points, which a floor holds
     least_extent: float = 1.5  # of a floor, along the longer side of what is seen of it
-    seed: int = 0
+    random_seed: int = 0
 
     def __post_init__(self) -> None:
         if self.remove_plane not in get_args(RemovePlane):
@@ -64,26 +65,34 @@ class ForegroundOptions:
 
 
 def foreground(
-    scan: Scan, diameter: float, options: ForegroundOptions | None = None
+    scan: Scan,
+    diameter: float,
+    options: ForegroundOptions | None = None,
+    T_scene_camera: Float[np.ndarray, "4 4"] | None = None,
 ) -> tuple[Bool[np.ndarray, " n"], tuple[str, ...]]:
     """Return which points of a scan may show an object of that diameter, and what the user should know of it.
 
-    The same scan and options give the same mask. Raises InputError if nothing is left, naming the step that took the
+    The scan is in its sensor's frame; region and empty bin are in the scene's, by default the same. The same scan and
+    options give the same mask. Raises InputError if nothing is left, naming the step that took the
     last points away.
     """
     options = options or ForegroundOptions()
+    pose = np.eye(4) if T_scene_camera is None else T_scene_camera
     if not 0 < diameter < math.inf:
         raise InputError(f"diameter is {diameter}, but must be above zero and finite")
     kept: Bool[np.ndarray, " n"] = np.ones(len(scan.points), dtype=bool)
     warnings: list[str] = []
     if options.roi is not None:
         low, high = np.array(options.roi[:3]), np.array(options.roi[3:])
-        kept &= ((scan.points >= low) & (scan.points <= high)).all(axis=1)
+        points = placed(pose, scan.points)
+        kept &= ((points >= low) & (points <= high)).all(axis=1)
         if not kept.any():
-            raise InputError(f"the region of interest holds none of the {len(kept)} points: {_box_of(scan)}")
+            raise InputError(
+                f"the region of interest holds none of the {len(kept)} points: {_box_of(points, scan.unit)}"
+            )
     if options.background is not None:
         before = int(kept.sum())
-        kept &= _off_background(scan, options.background, diameter, options.background_margin)
+        kept &= _off_background(scan, options.background, pose, diameter, options.background_margin)
         if not kept.any():
             raise InputError(f"all {before} points are those of the empty bin, or too near to it: is it really empty?")
     wanted = options.remove_plane == "always" or (options.remove_plane == "auto" and options.background is None)
@@ -102,22 +111,26 @@ def foreground(
         warnings += [warning] if warning else []
         chosen = np.flatnonzero(kept)
         least_extent = options.least_extent * diameter
-        kept[chosen] = off_walls(scan.points[chosen], ground, floor is not None, margin, least_extent, options.seed)
+        kept[chosen] = off_walls(
+            scan.points[chosen], ground, floor is not None, margin, least_extent, options.random_seed
+        )
     return kept, tuple(warnings)
 
 
-def _box_of(scan: Scan) -> str:
-    low, high = scan.points.min(axis=0), scan.points.max(axis=0)
+def _box_of(points: Float[np.ndarray, "n 3"], unit: str) -> str:
+    low, high = points.min(axis=0), points.max(axis=0)
     ranges = (f"{axis} from {a:g} to {b:g}" for axis, a, b in zip("xyz", low, high, strict=True))
-    return f"the scan has {', '.join(ranges)} {scan.unit}"
+    return f"the scan has {', '.join(ranges)} {unit}"
 
 
-def _off_background(scan: Scan, empty: Scan, diameter: float, margin: float) -> Bool[np.ndarray, " n"]:
+def _off_background(
+    scan: Scan, empty: Scan, T_scene_camera: Float[np.ndarray, "4 4"], diameter: float, margin: float
+) -> Bool[np.ndarray, " n"]:
     if METRES[empty.unit] != METRES[scan.unit]:
         empty = empty.in_unit(scan.unit)
     if scan.depth is not None and empty.depth is not None and scan.camera == empty.camera:
         return np.asarray(in_front_of_empty(scan.depth, empty.depth, diameter, margin))[scan.depth > 0]
-    return away_from_empty(scan.points, empty.points, diameter, margin)
+    return away_from_empty(scan.points, into(T_scene_camera, empty.points).astype(np.float32), diameter, margin)
 
 
 def _floor(
@@ -131,7 +144,7 @@ def _floor(
     searched, kept = points, None
     kept_text: str | None = None
     for _ in range(_PLANES):
-        plane = dominant_plane(searched, margin, options.seed)
+        plane = dominant_plane(searched, margin, options.random_seed)
         if plane is None:
             break
         height = plane.height(points)

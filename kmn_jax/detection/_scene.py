@@ -1,64 +1,93 @@
-"""A scan that is ready to be searched: seen from its sensor, thinned out, padded, with its foreground."""
+"""A scan that is ready to be searched: in its sensor's frame, with a depth image, thinned out, with its foreground."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 
-from kmn_jax.detection._scan_crop import SceneArrays, padded_points
-from kmn_jax.detection._search import CropFeatures
-from kmn_jax.detection._view import View
+from kmn_jax.detection._depth_agreement import DepthImage, depth_buffer
+from kmn_jax.detection._foreground import ForegroundOptions, foreground
+from kmn_jax.detection._frames import into
 from kmn_jax.errors import InputError
+from kmn_jax.geometry import Camera, PaddedCloud, intrinsics, pad_cloud
+from kmn_jax.io import Scan
 
 LEAST_POINTS = 4096  # the smallest capacity that is compiled
+MOST_POINTS = 131_072  # of a scan that are searched: more are thinned out at random
 _IMAGE_STEP = 256  # depth images are padded to a multiple of it
+_SIDE = 1024  # pixels along both sides of an image that is made of a cloud: one size, so one compilation
+_SAMPLE = 2000  # points whose spacing is measured
+_NEAREST = 1e-3  # of the distance of the cloud: a sensor nearer than that to a point lies in the cloud
+_MOST_BEHIND = 0.01  # share of the points: with more behind it, the sensor was not there
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A scan with all that searches for several parts share; the features of crops are kept for the next part."""
+    """A scan as searches take it. The camera is the sensor, z forward; lengths are in `unit`."""
 
-    view: View
     unit: str
-    foreground: Bool[np.ndarray, " r"]  # of `points`
-    points: Float32[np.ndarray, "r 3"]  # in the view's frame: all of the scan's, or a random part of them
-    arrays: SceneArrays  # the same, padded
-    depth: Float[Array, "h w"]  # the view's, padded
+    T_scene_camera: Float[np.ndarray, "4 4"]  # the scene's frame is that of the scan's file
+    camera: Camera
+    depth: Float32[np.ndarray, "h w"]  # zero where nothing was measured; made of the points if the scan is a cloud
+    points: Float32[np.ndarray, "r 3"]  # in the camera's frame: all that were seen, or a random part of them
+    foreground: Bool[np.ndarray, " r"]  # which of them may show objects
+    cloud: PaddedCloud  # the points again, on the device
+    image: DepthImage  # the depth again, padded, on the device
     warnings: tuple[str, ...] = ()
     doubt: str | None = None  # about its unit, told if nothing is found
-    features: dict[tuple[object, ...], CropFeatures] = field(default_factory=dict)
+    truth: tuple[Float[np.ndarray, "4 4"], ...] | None = None  # T_scene_object of all copies, if a dataset says
+    bop_ids: tuple[int, int, int] = (0, 0, 1)  # scene, image and object, of an image of a BOP dataset
 
 
 def make_scene(
-    view: View,
-    unit: str,
-    foreground: Bool[np.ndarray, " n"],
-    most_points: int,
+    scan: Scan,
+    diameter: float,
+    *,
+    sensor: Float[np.ndarray, "3"] | None = None,
+    background: ForegroundOptions | None = None,
+    inside: Bool[np.ndarray, " n"] | None = None,
     keep: Float[np.ndarray, "k 3"] | None = None,
-    warnings: tuple[str, ...] = (),
 ) -> Scene:
-    """Thin a view out and pad it; the points nearest to places `keep`, in the view's frame, stay.
+    """Make a scan ready for searches of objects of about a diameter.
 
-    The same view gives the same scene. Raises InputError if the foreground is empty.
+    `sensor` is where it was measured from, by default the origin; a depth image is in its sensor's frame. Foreground is
+    what `background` leaves, or the points that are `inside` of a known region. However a scan is thinned out, the
+    points nearest to places `keep` stay. Places and sensor are in the scan's frame. The same arguments give the same
+    scene. Raises InputError if the sensor's place lies among the points, or if no foreground is left.
     """
-    if not foreground.any():
+    if sensor is not None and scan.camera is not None:
+        raise InputError("a depth image is in the frame of its sensor: leave the sensor's place out")
+    view = _seen(scan, sensor)
+    seen = scan
+    if not np.array_equal(view.T_scene_camera, np.eye(4)) or len(view.rows) < len(scan.points):
+        seen = Scan(view.points, None, None, None, scan.unit)
+    warnings: tuple[str, ...] = ()
+    if inside is None:
+        front, warnings = foreground(seen, diameter, background or ForegroundOptions(), view.T_scene_camera)
+    else:
+        front = inside[view.rows]
+    if not front.any():
         raise InputError("no point of the scan is left as foreground: check background, region and units")
-    rows = _thinned(foreground, most_points)
+    rows = _thinned(front)
     if keep is not None:
-        rows = np.union1d(rows, [nearest_row(view.points, place) for place in keep])
+        rows = np.union1d(rows, [nearest_row(view.points, place) for place in into(view.T_scene_camera, keep)])
     points = view.points[rows]
-    height, width = (-size % _IMAGE_STEP for size in view.depth.shape)
+    spare = (-size % _IMAGE_STEP for size in view.depth.shape)
+    padded = np.pad(view.depth, [(0, size) for size in spare])
     return Scene(
-        view,
-        unit,
-        foreground[rows],
+        scan.unit,
+        view.T_scene_camera,
+        view.camera,
+        view.depth,
         points,
-        SceneArrays(*padded_points(points, LEAST_POINTS)),
-        jnp.asarray(np.pad(view.depth, ((0, height), (0, width)))),
+        front[rows],
+        pad_cloud(points, LEAST_POINTS),
+        DepthImage(jnp.asarray(padded), intrinsics(view.camera)),
         warnings,
     )
 
@@ -68,18 +97,81 @@ def nearest_row(points: Float32[np.ndarray, "n 3"], place: Float[np.ndarray, "3"
     return int(((points - place) ** 2).sum(axis=1).argmin())
 
 
-def padded_flags(flags: Bool[np.ndarray, " r"], capacity: int) -> Bool[Array, " c"]:
-    """Return flags of points as long as the padded points are."""
-    return jax.device_put(np.pad(flags, (0, capacity - len(flags))))
+class _Seen(NamedTuple):
+    """A scan as its sensor saw it."""
+
+    T_scene_camera: Float[np.ndarray, "4 4"]
+    points: Float32[np.ndarray, "n 3"]
+    depth: Float32[np.ndarray, "h w"]
+    camera: Camera
+    rows: Int[np.ndarray, " n"]  # of the scan's points: all but those behind the sensor
 
 
-def _thinned(foreground: Bool[np.ndarray, " n"], most: int) -> Int[np.ndarray, " k"]:
+def _seen(scan: Scan, sensor: Float[np.ndarray, "3"] | None) -> _Seen:
+    """Return a scan in its sensor's frame: a depth image as it is, a cloud with an image about as fine as its points.
+
+    Raises InputError if the sensor's place lies among the points.
+    """
+    if scan.depth is not None and scan.camera is not None:
+        return _Seen(np.eye(4), scan.points, scan.depth, scan.camera, np.arange(len(scan.points)))
+    place = np.zeros(3) if sensor is None else np.asarray(sensor, dtype=np.float64)
+    offsets = scan.points.astype(np.float64) - place
+    distances = np.linalg.norm(offsets, axis=1)
+    typical = float(np.median(distances))
+    rotation = _towards(offsets.mean(axis=0), typical)
+    points = offsets @ rotation.T
+    if distances.min() <= _NEAREST * typical or (points[:, 2] <= 0).mean() > _MOST_BEHIND:
+        where = "the origin" if sensor is None else f"{tuple(float(x) for x in place)}"
+        raise InputError(f"the sensor cannot have been at {where}, among the points: say where it was")
+    rows = np.flatnonzero(points[:, 2] > 0)
+    points = points[rows].astype(np.float32)
+    camera = _fine_camera(points)
+    T_scene_camera = np.eye(4)
+    T_scene_camera[:3, :3], T_scene_camera[:3, 3] = rotation.T, place
+    depth = _depth_buffer(*pad_cloud(points), intrinsics(camera), shape=(camera.height, camera.width))
+    return _Seen(T_scene_camera, points, np.asarray(depth), camera, rows)
+
+
+def _towards(direction: Float[np.ndarray, "3"], typical: float) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation that makes a direction the z axis, the identity if it nearly is."""
+    length = float(np.linalg.norm(direction))
+    if length < _NEAREST * typical:
+        return np.eye(3)  # all around: refused by what follows
+    z = direction / length
+    if z[2] > np.cos(np.radians(30)):
+        return np.eye(3)
+    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _fine_camera(points: Float32[np.ndarray, "n 3"]) -> Camera:
+    """Return a camera that sees all points, with pixels as wide as points are apart if it has enough of them."""
+    from scipy.spatial import cKDTree
+
+    directions = points[:, :2] / points[:, 2:]
+    low, high = np.percentile(directions, 0.1, axis=0), np.percentile(directions, 99.9, axis=0)
+    chosen = np.random.default_rng(0).permutation(len(points))[:_SAMPLE]
+    spacing = 0.0
+    if len(points) > 1:
+        apart = cKDTree(directions).query(directions[chosen], k=2)[0][:, 1]
+        spacing = float(np.percentile(apart, 75))
+    extent = max(float((high - low).max()), 1e-3)  # also of a single point
+    focal = 1 / max(spacing, extent / (_SIDE - 2))
+    return Camera(focal, focal, float(1 - low[0] * focal), float(1 - low[1] * focal), _SIDE, _SIDE)
+
+
+def _thinned(front: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
     """Return a random part of the rows, in their order; all if they are few."""
-    total = len(foreground)
-    if total <= most:
+    total = len(front)
+    if total <= MOST_POINTS:
         return np.arange(total)
-    kept = np.random.default_rng(0).choice(total, most, replace=False)
+    kept = np.random.default_rng(0).choice(total, MOST_POINTS, replace=False)
     kept.sort()
-    if not foreground[kept].any():  # then the foreground is small: it stays whole
-        kept = np.union1d(kept[: most // 2], np.flatnonzero(foreground)[: most // 2])
+    if not front[kept].any():  # then the foreground is small: it stays whole
+        half = MOST_POINTS // 2
+        kept = np.union1d(kept[:half], np.flatnonzero(front)[:half])
     return kept
+
+
+_depth_buffer = jax.jit(depth_buffer, static_argnames="shape")

@@ -1,199 +1,185 @@
-"""Pose hypotheses of a whole bin: one crop around each seed point, all in one call, each with its best pose."""
+"""Candidates: the poses around seeds of a scene, and what speaks for and against each."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, ArrayLike, Bool, Float, Float32, Int, Key
 
-from kmn_jax.data import CropConfig, crop_around
-from kmn_jax.detection._scan_crop import SceneArrays, as_visible, even_rows
-from kmn_jax.geometry import farthest_point_indices
+from kmn_jax.detection._crop_search import (
+    CropPoses,
+    CropSearchConfig,
+    Prediction,
+    crop_of_scene,
+    find_poses_in_crop,
+)
+from kmn_jax.detection._depth_agreement import DepthAgreementConfig, DepthImage
+from kmn_jax.detection._device_part import DevicePart
+from kmn_jax.detection._evidence import gather_evidence
+from kmn_jax.detection._mapping import call_rows
+from kmn_jax.detection._result import CropPrediction
+from kmn_jax.detection._scene import Scene
+from kmn_jax.geometry import Crop, PaddedCloud
+from kmn_jax.models import Model
 from kmn_jax.objects import PartArrays
-from kmn_jax.pose import IcpConfig, MatchConfig, PoseResult, RansacConfig, find_matches, icp, ransac_modes
-from kmn_jax.typing import PRNGKey, Scalar
-
-_Result = TypeVar("_Result")
+from kmn_jax.typing import PRNGKey
 
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """How poses are searched around a seed; lengths are shares of the object's diameter."""
+    """How poses are searched around seeds, and compared with the depth image."""
 
-    matches: MatchConfig = field(default_factory=lambda: MatchConfig(capacity=1024))
-    ransac: RansacConfig = field(default_factory=lambda: RansacConfig(num_hypotheses=500, num_candidates=8192))
-    num_modes: int = 3  # poses of a crop that are refined
-    icp: IcpConfig = field(default_factory=lambda: IcpConfig(iterations=6))
-    icp_points: int = 128  # of a crop, on the object
-    normal_radius: float = 0.06
-    normal_points: int = 4096  # drawn around a seed for normals; the network's number of them is the crop
+    crops: CropSearchConfig = field(default_factory=CropSearchConfig)
+    agreement: DepthAgreementConfig = field(default_factory=DepthAgreementConfig)
 
 
-class CropFeatures(NamedTuple):
-    """Crops around s seeds, as the network sees them; points are relative to the seed, in the scene's axes and unit."""
+class Candidates(NamedTuple):
+    """Poses of a part, each with its evidence; arrays on the host, lengths in the scene's unit."""
 
-    points: Float[Array, "s n 3"]
-    normals: Float[Array, "s n 3"]
-    mask: Bool[Array, "s n"]
-    seed: Float[Array, "s 3"]
-    valid: Bool[Array, " s"]  # whether enough points are around the seed
-    features: Float[Array, "s n f"]
+    T_camera_object: Float32[np.ndarray, "s 4 4"]
+    usable: Bool[np.ndarray, " s"]  # whether a pose was found
+    evidence: Float32[np.ndarray, "s f"]  # see EVIDENCE
+    num_inliers: Int[np.ndarray, " s"]
+    crop: Int[np.ndarray, " s"]  # that it was found in, of c
+    found: CropPoses  # of the crops, (c, ...)
+    seed_rows: Int[np.ndarray, " c"]  # of the crops, in the scene's points
 
-
-class Hypotheses(NamedTuple):
-    """h poses for each of s seeds, in the scene's frame and unit."""
-
-    T_scene_object: Float[Array, "s h 4 4"]  # the identity where there is none
-    found: Bool[Array, "s h"]
-    num_inliers: Int[Array, "s h"]  # matches that agree on it
-    inlier_share: Float[Array, "s h"]  # of the usable matches
+    @property
+    def is_first(self) -> Bool[np.ndarray, " s"]:
+        """Which poses are the first ones of their crops: those that the surface confirms best."""
+        return np.diff(self.crop, prepend=-1) > 0
 
 
-class Predictions(NamedTuple):
-    """What the network says of the n points of s crops."""
+def search_at(
+    model: Model, part: DevicePart, scene: Scene, rows: Int[np.ndarray, " c"], random_seed: int, config: SearchConfig
+) -> Candidates:
+    """Return the poses in the crops around seeds; `config` is that of a network, see `CropSearchConfig.of_network`.
 
-    on_object: Bool[Array, "s n"]  # taken for the seed's instance
-    scores: Float[Array, "s n k"]  # of the keypoints, 1 in sum
-
-
-def spread_seeds(
-    scene: SceneArrays, candidates: Bool[Array, " r"], count: int
-) -> tuple[Int[Array, " count"], Bool[Array, " count"]]:
-    """Return rows of candidates spread over the scene, each the farthest from those before it, and which are real.
-
-    With fewer candidates than `count` the others repeat one, and are not real.
+    What is found around a point does not depend on what else is searched.
     """
-    usable = scene.mask & candidates
-    anchor = jnp.argmax(usable).astype(jnp.int32)
-    # What is no candidate sits on one: it is the farthest only when no other is left.
-    rows = farthest_point_indices(jnp.where(usable[:, None], scene.points, scene.points[anchor][None]), count, None)
-    rows = jnp.where(usable[rows], rows, anchor)
-    same = jnp.tril(rows[:, None] == rows[None, :], -1).any(axis=1)
-    return rows, ~same & usable[anchor]
-
-
-def seed_keys(key: PRNGKey, count: int) -> tuple[Key[Array, " s"], Key[Array, " s"]]:
-    """Return keys of so many crops, and of the pose searches in them."""
-    crop_key, pose_key = jax.random.split(key)
-    return jax.random.split(crop_key, count), jax.random.split(pose_key, count)
-
-
-@partial(jax.jit, static_argnames=("graphdef", "config", "num_points"))
-def crop_features(
-    graphdef: nnx.GraphDef,
-    parameters: nnx.State,
-    scene: SceneArrays,
-    seeds: Int[Array, " s"],
-    real: Bool[Array, " s"],
-    length: Scalar,
-    keys: Key[Array, " s"],
-    config: SearchConfig,
-    num_points: int,
-) -> CropFeatures:
-    """Return the features of crops of radius `length`, an object's diameter, around seed rows of the scene.
-
-    Where `real` is false the crop is empty and not valid.
-    """
-    network = nnx.merge(graphdef, parameters)
-    visible = as_visible(scene)
-    crops = CropConfig(
-        num_points=num_points,
-        max_noise=0.0,
-        normal_radius=config.normal_radius,
-        normal_points=config.normal_points,
-        min_points=min(16, num_points),
+    keys = seed_keys(rows, random_seed)
+    given = (*model, part, scene.cloud, scene.image)
+    found, evidence = call_rows(
+        partial(search_one, *given, config=config),
+        partial(_search_many, *given, config=config),
+        rows.astype(np.int32),
+        keys,
     )
-
-    def one(seed: Int[Array, ""], key: Key[Array, ""]) -> CropFeatures:
-        crop = crop_around(key, visible, seed, scene.mask[seed], jnp.zeros((1, 3)), jnp.eye(4)[None], length, crops)
-        cloud = jnp.concatenate([crop.points, crop.normals], axis=1)
-        features = network.encode_scene(cloud, length, crop.mask)
-        return CropFeatures(crop.points, crop.normals, crop.mask, crop.seed, crop.valid, features)
-
-    return each(one, real, seeds, keys)
+    return candidates_of(found, evidence, rows)
 
 
-@partial(jax.jit, static_argnames=("graphdef", "config"))
-def search(
+def poses_at(
+    model: Model, part: PartArrays, cloud: PaddedCloud, row: int, random_seed: int, config: CropSearchConfig
+) -> CropPoses:
+    """Return the poses around the point in a row of a cloud, as a search of a scene of these points finds them."""
+    return _poses_around(*model, part, cloud, np.int32(row), seed_keys(np.array([row]), random_seed)[0], config)
+
+
+def seed_crop(part: PartArrays, cloud: PaddedCloud, row: int, random_seed: int, config: CropSearchConfig) -> Crop:
+    """Return the crop that `poses_at` with the same arguments searches."""
+    crop_key, _ = jax.random.split(seed_keys(np.array([row]), random_seed)[0])
+    return crop_of_scene(cloud, np.int32(row), part.diameter, crop_key, config)
+
+
+def _poses_around(
     graphdef: nnx.GraphDef,
     parameters: nnx.State,
     part: PartArrays,
-    crops: CropFeatures,
-    keys: Key[Array, " s"],
-    config: SearchConfig,
-) -> tuple[Hypotheses, Predictions]:
-    """Return the best poses of a part in each valid crop, and what the network says of its points."""
-    network = nnx.merge(graphdef, parameters)
-    num_keypoints = part.features.shape[0]
-    keypoints, keypoint_normals = part.points[:num_keypoints], part.normals[:num_keypoints]
-
-    def one(crop: CropFeatures, key: Key[Array, ""]) -> tuple[Hypotheses, Predictions]:
-        segmentation, logits = network.match(crop.features, part.features, crop.mask)
-        matches = find_matches(
-            segmentation,
-            logits,
-            crop.points,
-            crop.normals,
-            keypoints,
-            keypoint_normals,
-            part.diameter,
-            crop.mask,
-            config.matches,
-        )
-        on_object = crop.mask & (segmentation[:, 1] > segmentation[:, 0])
-        coarse = ransac_modes(key, matches, config.num_modes, config.ransac)
-        rows, real = spread_rows(on_object, config.icp_points)
-
-        def refined(coarse: PoseResult) -> Hypotheses:
-            fine = icp(
-                part.points,
-                crop.points[rows],
-                coarse.T_scene_object,
-                part.diameter,
-                scene_normals=crop.normals[rows],
-                scene_mask=real,
-                config=config.icp,
-            )
-            pose = fine.T_scene_object.at[:3, 3].add(crop.seed)
-            return Hypotheses(pose, coarse.converged, coarse.num_inliers, coarse.score)
-
-        found = jax.lax.platform_dependent(
-            coarse, cpu=lambda modes: jax.lax.map(refined, modes), default=jax.vmap(refined)
-        )
-        return found, Predictions(on_object, jax.nn.softmax(logits, axis=1))
-
-    found, predictions = each(one, crops.valid, crops, keys)
-    poses = jnp.where(found.found[:, :, None, None], found.T_scene_object, jnp.eye(4)[None, None])
-    return found._replace(T_scene_object=poses), predictions
+    cloud: PaddedCloud,
+    row: Int[ArrayLike, ""],
+    key: PRNGKey,
+    config: CropSearchConfig,
+) -> CropPoses:
+    crop_key, pose_key = jax.random.split(key)
+    crop = crop_of_scene(cloud, row, part.diameter, crop_key, config)
+    return find_poses_in_crop(graphdef, parameters, part, crop, pose_key, config)
 
 
-def spread_rows(mask: Bool[Array, " n"], count: int) -> tuple[Int[Array, " c"], Bool[Array, " c"]]:
-    """Return rows where a mask is true, evenly chosen among them if they are more than `count`, and which are real."""
-    count = min(count, mask.shape[0])
-    total = mask.sum(dtype=jnp.int32)
-    order = jnp.nonzero(mask, size=mask.shape[0], fill_value=0)[0]
-    place = jnp.arange(count, dtype=jnp.int32)
-    return order[jnp.where(total > count, even_rows(place, total, count), place)], place < total
+def seed_keys(rows: Int[np.ndarray, " c"], random_seed: int) -> Key[Array, " c"]:
+    """Return the random key of each seed."""
+    return _keys(jax.random.key(random_seed), jnp.asarray(rows, dtype=jnp.int32))
 
 
-def each(function: Callable[..., _Result], real: Bool[Array, " s"], *items: Any) -> _Result:
-    """Map over leading axes, to zeros where `real` is false.
-
-    On CPUs one item comes after the other, as side by side what is computed leaves the cache, and what is not real is
-    skipped.
-    """
-    first = jax.tree.map(lambda leaf: leaf[0], items)
-    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, *first))
-
-    def one(real: Bool[Array, ""], *item: Any) -> _Result:
-        return jax.lax.cond(real, function, lambda *item: zeros, *item)
-
-    return jax.lax.platform_dependent(
-        real, *items, cpu=lambda *items: jax.lax.map(lambda item: one(*item), items), default=jax.vmap(one)
+def candidates_of(found: CropPoses, evidence: Float[np.ndarray, "c h f"], rows: Int[np.ndarray, " c"]) -> Candidates:
+    """Return what was found in crops as candidates."""
+    count, modes = found.poses.converged.shape
+    poses: Any = jax.tree.map(lambda leaf: leaf.reshape(count * modes, *leaf.shape[2:]), found.poses)
+    return Candidates(
+        poses.T_scene_object,
+        poses.converged,
+        evidence.reshape(count * modes, -1),
+        poses.num_inliers,
+        np.repeat(np.arange(count), modes),
+        found,
+        rows,
     )
+
+
+def join(parts: list[Candidates]) -> Candidates:
+    """Return the candidates of several searches as one."""
+    starts = np.cumsum([0, *(len(part.seed_rows) for part in parts)])
+    shifted = [part._replace(crop=part.crop + start) for part, start in zip(parts, starts, strict=False)]
+    joined: Any = jax.tree.map(lambda *leaves: np.concatenate(leaves), *shifted)
+    return cast(Candidates, joined)
+
+
+def crop_prediction(found: Candidates, row: int) -> CropPrediction:
+    """Return what the network says of the crop of a candidate, in the camera's frame."""
+    crop: CropPoses = jax.tree.map(lambda leaf: leaf[found.crop[row]], found.found)
+    return network_prediction(crop.prediction, crop.seed)
+
+
+def network_prediction(prediction: Prediction, seed: Float[Array | np.ndarray, "3"]) -> CropPrediction:
+    """Return what the network says of a draw's points, as a plain record in the frame that the seed is in."""
+    mask = np.asarray(prediction.mask)
+    return CropPrediction(
+        (np.asarray(prediction.points) + np.asarray(seed))[mask],
+        np.asarray(prediction.on_object)[mask],
+        np.asarray(prediction.logits).argmax(axis=1).astype(np.int32)[mask],
+    )
+
+
+def search_one(
+    graphdef: nnx.GraphDef,
+    parameters: nnx.State,
+    part: DevicePart,
+    cloud: PaddedCloud,
+    image: DepthImage,
+    row: Int[ArrayLike, ""],
+    key: PRNGKey,
+    config: SearchConfig,
+) -> tuple[CropPoses, Float[Array, "h f"]]:
+    """Return the poses around the point in a row, and the evidence on each; `config` is that of a network.
+
+    Three compiled calls, of which the size of the cloud enters the first alone, and that of the image the last.
+    """
+    found = _poses_around(graphdef, parameters, part.arrays, cloud, row, key, config.crops)
+    return found, gather_evidence(found, part.arrays, part.surfels, image, config.agreement)
+
+
+@partial(jax.jit, static_argnames=("graphdef", "config"))
+def _search_many(
+    graphdef: nnx.GraphDef,
+    parameters: nnx.State,
+    part: DevicePart,
+    cloud: PaddedCloud,
+    image: DepthImage,
+    rows: Int[Array, " c"],
+    keys: Key[Array, " c"],
+    config: SearchConfig,
+) -> tuple[CropPoses, Float[Array, "c h f"]]:
+    def one(row: Int[Array, ""], key: PRNGKey) -> tuple[CropPoses, Float[Array, "h f"]]:
+        return search_one(graphdef, parameters, part, cloud, image, row, key, config)
+
+    return jax.vmap(one)(rows, keys)
+
+
+@jax.jit
+def _keys(key: PRNGKey, rows: Int[Array, " c"]) -> Key[Array, " c"]:
+    return jax.vmap(lambda row: jax.random.fold_in(key, row))(rows)

@@ -2,6 +2,7 @@
 
 from kmn_jax.geometry._ball_normals import normals_within_radius
 from kmn_jax.geometry._camera import Camera, Intrinsics, intrinsics, measured_points
+from kmn_jax.geometry._crops import Crop, PaddedCloud, crop_around, draw_rows, even_rows, pad_cloud, spread_rows
 from kmn_jax.geometry._eigen import dominant_eigenvector
 from kmn_jax.geometry._knn import (
     first_smallest,
@@ -30,19 +31,24 @@ from kmn_jax.geometry._se3 import (
     transform_points,
     translation_between,
 )
-from kmn_jax.geometry._smoothing import SmoothConfig, smoothed
+from kmn_jax.geometry._smoothing import SmoothConfig, smoothed, towards_camera, with_normals
 from kmn_jax.geometry._subsets import Selection, radius_crop, voxel_thin
 
 __all__ = [
     "Camera",
+    "Crop",
     "Intrinsics",
+    "PaddedCloud",
     "Selection",
     "SmoothConfig",
     "compose",
+    "crop_around",
     "depth_normals",
     "depth_to_points",
     "dominant_eigenvector",
+    "draw_rows",
     "estimate_normals",
+    "even_rows",
     "farthest_point_indices",
     "first_smallest",
     "from_quaternion_translation",
@@ -57,6 +63,7 @@ __all__ = [
     "neighbor_graph",
     "normals_within_radius",
     "orient_to_camera",
+    "pad_cloud",
     "pose_error",
     "quaternion_to_matrix",
     "radius_crop",
@@ -68,8 +75,11 @@ __all__ = [
     "safe_sqrt",
     "smoothed",
     "space_filling_order",
+    "spread_rows",
     "squared_distances",
+    "towards_camera",
     "transform_points",
     "translation_between",
     "voxel_thin",
+    "with_normals",
 ]

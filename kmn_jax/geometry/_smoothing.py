@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from kmn_jax.geometry._ball_normals import planes_within_radius
+from kmn_jax.geometry._ball_normals import normals_within_radius, planes_within_radius
+from kmn_jax.geometry._normals import orient_to_camera
 from kmn_jax.typing import Scalar
 
 
@@ -64,3 +65,35 @@ def smoothed(
     share = jnp.minimum(noise / (config.moved_noise * diameter), 1) ** 2
     moved = points - share * planes.heights[:, None] * planes.normals
     return jnp.where(mask[:, None], moved, points), planes.normals, planes.valid & mask, noise
+
+
+def with_normals(
+    points: Float[Array, "q 3"],
+    mask: Bool[Array, " q"],
+    cloud: Float[Array, "n 3"],
+    cloud_mask: Bool[Array, " n"],
+    camera: Float[Array, "3"],
+    diameter: Scalar,
+    normal_radius: float,
+    smooth: SmoothConfig | None,
+) -> tuple[Float[Array, "q 3"], Float[Array, "q 3"]]:
+    """Return points as the network takes them, with unit normals towards the camera; zero where masked out.
+
+    `cloud` is all that was measured around the points. Without smoothing, normals are those of the planes within
+    `normal_radius` (a share of the diameter), and points stay. Where there is no plane, the normal is the direction to
+    the camera, whose place is given.
+    """
+    if smooth is None:
+        normals, known = normals_within_radius(points, cloud, normal_radius * diameter, cloud_mask)
+    else:
+        points, normals, known, _ = smoothed(points, mask, cloud, cloud_mask, diameter, smooth)
+    return points, jnp.where(mask[:, None], towards_camera(points, normals, known, camera), 0)
+
+
+def towards_camera(
+    points: Float[Array, "n 3"], normals: Float[Array, "n 3"], known: Bool[Array, " n"], camera: Float[Array, "3"]
+) -> Float[Array, "n 3"]:
+    """Return normals turned towards a camera; where one is not known, the direction to it."""
+    away = camera[None] - points
+    length = jnp.sqrt((away**2).sum(axis=1, keepdims=True))
+    return jnp.where(known[:, None], orient_to_camera(points, normals, camera), away / jnp.where(length > 0, length, 1))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from kmn_jax.detection import Detection, Detections, View, placed
+from kmn_jax.detection import Detection, Detections, Scene, placed
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
 from kmn_jax.geometry import Camera
@@ -39,7 +39,7 @@ def check_picture(path: str | Path) -> None:
 
 def save_picture(
     path: str | Path,
-    view: View,
+    view: Scene,
     part: Part,
     found: Detections,
     truth: Sequence[Float[np.ndarray, "4 4"]] | None = None,
@@ -86,9 +86,9 @@ def save_picture(
 class _Drawing:
     """What the panels share: the scan's shading, the crops' points, and the raster they are drawn on."""
 
-    def __init__(self, view: View, part: Part, found: Detections) -> None:
+    def __init__(self, view: Scene, part: Part, found: Detections) -> None:
         self.view, self.part, self.found = view, part, found
-        self.T_view_scene = np.linalg.inv(view.T_scene_view)
+        self.T_view_scene = np.linalg.inv(view.T_scene_camera)
         self.pose_colors = distinct_colors(max(1, len(found.poses)))
         self.surface = surface_discs(part.points, part.normals)
         self.step, self.depth, self.shade = relief_of(view.depth, view.camera, RELIEF * part.diameter)
@@ -295,7 +295,7 @@ def _eroded(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return mask & padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
 
 
-def _measured_box(view: View) -> tuple[float, float, float, float]:
+def _measured_box(view: Scene) -> tuple[float, float, float, float]:
     """Return left, right, bottom and top of what was measured, in pixels; few strays are left out."""
     rows, columns = np.nonzero(view.depth > 0)
     if not len(rows):

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from kmn_jax.detection import Detection, Detections, View
+from kmn_jax.detection import Detection, Detections, Scene
 from kmn_jax.errors import InputError
 from kmn_jax.objects import Part
 from kmn_jax.viz._legend import LIKELY, ranked, summary
@@ -46,7 +46,7 @@ class Viewer:
 
     def __init__(
         self,
-        view: View,
+        view: Scene,
         part: Part,
         found: Detections,
         host: str = "127.0.0.1",

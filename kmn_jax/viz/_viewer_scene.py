@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, UInt8, UInt32
 
-from kmn_jax.detection import Detection, View, into, placed
+from kmn_jax.detection import Detection, Scene, into, placed
 from kmn_jax.objects import Part
 from kmn_jax.viz._legend import LIKELY, NOT_THE_PART, center_of
 from kmn_jax.viz._picture import RELIEF
@@ -39,10 +39,10 @@ class PoseNodes:
 class PageScene:
     """The scan and the poses on the page of a viser server."""
 
-    def __init__(self, server: Any, view: View, part: Part) -> None:
+    def __init__(self, server: Any, view: Scene, part: Part) -> None:
         """Add the scan, and set the camera on the sensor's side, as near as the scan fills the page."""
         self._scene, self._view, self._part = server.scene, view, part
-        self._T_view_scene = np.linalg.inv(view.T_scene_view)
+        self._T_view_scene = np.linalg.inv(view.T_scene_camera)
         low, high = np.percentile(view.points, [1, 99], axis=0).astype(np.float64)
         self._center = (low + high) / 2
         self._size = max(float(np.linalg.norm(high - low)), 0.5 * part.diameter)
@@ -126,7 +126,7 @@ class PageScene:
         row = nearest_to_ray(self._points, origin, direction)
         if row is None:
             return None
-        return placed(self._view.T_scene_view, self._view.points[row].astype(np.float64)[None])[0]
+        return placed(self._view.T_scene_camera, self._view.points[row].astype(np.float64)[None])[0]
 
     def mark(self, point: Float[np.ndarray, "3"]) -> Any:
         """Mark a point of the scene's frame; return the node."""

@@ -12,31 +12,27 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from kmn_jax.detection._verify import VerifyConfig, farthest_at
-from kmn_jax.geometry import Intrinsics, transform_points
+from kmn_jax.detection._depth_agreement import DepthAgreementConfig, DepthImage, farthest_at
+from kmn_jax.geometry import transform_points
 from kmn_jax.simulate import Surfels
 from kmn_jax.typing import Pose, Scalar
 
 
-class Contour(NamedTuple):
+class OutlineAgreement(NamedTuple):
     """Shares of the outline inside of the image; the rest is hidden."""
 
     open: Scalar  # something farther away was measured beyond it, or nothing, as where the background is cut away
     level: Scalar  # the measured surface goes on beyond it
 
 
-def contour(
-    T_camera_object: Pose,
-    surfels: Surfels,
-    depth: Float[Array, "h w"],
-    camera: Intrinsics,
-    diameter: Scalar,
-    config: VerifyConfig,
-) -> Contour:
+def outline_agreement(
+    T_camera_object: Pose, surfels: Surfels, image: DepthImage, diameter: Scalar, config: DepthAgreementConfig
+) -> OutlineAgreement:
     """Compare the outline of an object at a pose with a depth image in the same unit, zero where nothing was measured.
 
     The outline is the cells of a grid over the object's picture that are two away from it; holes have one, too.
     """
+    depth, camera = image
     points = transform_points(T_camera_object, surfels.points)
     normals = jnp.matmul(surfels.normals, T_camera_object[:3, :3].T, precision=jax.lax.Precision.HIGHEST)
     facing = ((points * normals).sum(axis=1) < 0) & (points[:, 2] > 0)
@@ -71,7 +67,9 @@ def contour(
     def share(which: Bool[Array, "s s"]) -> Scalar:
         return (shown & which).sum(dtype=jnp.int32).astype(jnp.float32) / count
 
-    return Contour(share((gap > tolerance) | (measured == 0)), share((jnp.abs(gap) <= tolerance) & (measured > 0)))
+    return OutlineAgreement(
+        share((gap > tolerance) | (measured == 0)), share((jnp.abs(gap) <= tolerance) & (measured > 0))
+    )
 
 
 def _farthest_around(front: Float[Array, "s s"]) -> Float[Array, "s s"]:

@@ -1,4 +1,4 @@
-"""Poses against the measured surface: what of an object's visible side the scan confirms, and what it contradicts."""
+"""Poses against a depth image: what of an object's visible side it confirms, and what it contradicts."""
 
 from __future__ import annotations
 
@@ -8,31 +8,39 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from kmn_jax.errors import InputError
 from kmn_jax.geometry import Intrinsics
 from kmn_jax.simulate import SplatConfig, Surfels, visible_by_splatting
 from kmn_jax.typing import Pose, Scalar
 
 
 @dataclass(frozen=True)
-class VerifyConfig:
+class DepthAgreementConfig:
     """Set the comparison; the tolerance is a share of the object's diameter."""
 
     tolerance: float = 0.03  # between predicted and measured depth
     sunk: float = 0.2  # what lies in front by less than this is more likely the surface itself than another part
-    outline_cells: int = 40  # of a grid over the object's picture, along the longer side; see contour.py
+    outline_cells: int = 40  # of a grid over the object's picture, along the longer side; see _outline.py
     window: int = 1  # pixels to each side in which a measurement may lie: edges are off by one
     splat: SplatConfig = field(default_factory=lambda: SplatConfig(resolution=128))
 
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
         if not 0 < self.tolerance < self.sunk or self.window < 0 or self.outline_cells < 1:
-            raise ValueError(
+            raise InputError(
                 f"tolerance = {self.tolerance} must be above zero and below sunk = {self.sunk}, outline_cells ="
                 f" {self.outline_cells} above zero, and window = {self.window} not below zero"
             )
 
 
-class Agreement(NamedTuple):
+class DepthImage(NamedTuple):
+    """A depth image, zero where nothing was measured, and its camera."""
+
+    depth: Float[Array, "h w"]
+    camera: Intrinsics
+
+
+class DepthAgreement(NamedTuple):
     """Shares of the picture area that an object at a pose would cover if nothing hid it; the first four sum up to 1.
 
     Missing measurements, as on shiny flanks, speak neither for nor against a pose.
@@ -45,15 +53,11 @@ class Agreement(NamedTuple):
     sunk: Scalar  # of what is occluded, the share of the whole that something hides from close by
 
 
-def agreement(
-    T_camera_object: Pose,
-    surfels: Surfels,
-    depth: Float[Array, "h w"],
-    camera: Intrinsics,
-    diameter: Scalar,
-    config: VerifyConfig,
-) -> Agreement:
+def depth_agreement(
+    T_camera_object: Pose, surfels: Surfels, image: DepthImage, diameter: Scalar, config: DepthAgreementConfig
+) -> DepthAgreement:
     """Compare an object at a pose with a depth image in the same unit, zero where nothing was measured."""
+    depth, camera = image
     seen = visible_by_splatting(surfels, T_camera_object[None], jnp.ones(1, dtype=bool), camera, None, config.splat)
     row, column, z = _pixels(seen.points, seen.mask, camera)
     measured = _window(depth, row, column, config.window)
@@ -71,7 +75,7 @@ def agreement(
 
     occluded = some & ~behind & ~near
     close = (there & (gap < 0) & (gap > -config.sunk * diameter)).any(axis=1)
-    return Agreement(
+    return DepthAgreement(
         explained=share(near),
         violated=share(some & behind & ~near),
         occluded=share(occluded),
