@@ -3,7 +3,7 @@
 python -m benchmarks.crops [--batches 1 4 16 64] [--folder DATASET] [--json FILE]
 
 Open3D's FPFH and RANSAC get the same crops; their poses are counted and timed without refinement and with the ICP that
-all methods of an evaluation share, ours with that of the same call.
+all methods of an evaluation share, ours with the refinement of the same call.
 
 A crop's stages are one compiled call, a bin's too: depth image in, ranked poses out. Beside a bin's call stands the
 search in rounds of `PoseEstimator.detect`, which refines on more points and compares turned forms of each pose.
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,18 +24,25 @@ import numpy as np
 import tyro
 
 from benchmarks.network_cases import each
-from benchmarks.stages import REFINED, small_crop
+from benchmarks.stages import SEARCH, small_crop
 from benchmarks.timing import compile_for, time_in_turn
 from experiments.bins import LEAST_VISIBLE, THRESHOLD, BinImage, bin_images
 from experiments.evaluation.cases import Case, ObjectImages, Solver, draw_cases
-from experiments.evaluation.methods import Ours, OursConfig
+from experiments.evaluation.methods import Ours
 from experiments.evaluation.refinement import Refinement
 from experiments.evaluation.rivals import missing
 from experiments.evaluation.scores import pair_errors
 from experiments.evaluation.sources import bop_objects
 from experiments.evaluation.tuned import RIVALS
-from kmn_jax.detection import BinPosesConfig, PoseEstimator, Sight, bin_part, bin_poses, crop_pose
-from kmn_jax.geometry import intrinsics
+from kmn_jax.detection import (
+    BinPosesConfig,
+    PoseEstimator,
+    bin_poses,
+    device_calibration,
+    device_part,
+    poses_in_crop,
+    search_crop,
+)
 from kmn_jax.models import Model
 from kmn_jax.objects import ObjectModel
 from kmn_jax.report import print_table, write_json
@@ -79,7 +87,7 @@ def same_crops(model: Model, found: ObjectImages, repeats: int, count: int = 12)
     cases = list(draw_cases(found, count, 0.01))
     if not cases:
         return []
-    solvers = {"ours, refined": Ours("ours", model, OursConfig(REFINED)).prepare(found.model)}
+    solvers = {"ours, refined": Ours("ours", model).prepare(found.model)}
     module, make = RIVALS["fpfh"]
     if (reason := missing(module)) is None:
         solve = make().prepare(found.model)
@@ -127,20 +135,21 @@ def _error(pose: np.ndarray, case: Case, model: ObjectModel) -> float:
 
 def crop_row(batch: int, repeats: int) -> dict[str, Any]:
     """Time the same crop, many times at once, each with draws of its own."""
-    model, part, scene = small_crop()
-    count = model.config.num_scene_points
+    model, part, cloud = small_crop()
+    config = SEARCH.of_network(model.config)
     keys = jax.random.split(jax.random.key(0), batch)
-    scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (batch, *leaf.shape)), scene)
+    clouds = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (batch, *leaf.shape)), cloud)
 
-    def solve(parameters: Any, part: Any, scenes: Any, keys: jax.Array) -> Any:
+    def solve(parameters: Any, part: Any, clouds: Any, keys: jax.Array) -> Any:
         def one(item: Any) -> Any:
-            scene, key = item
-            return crop_pose(model.graphdef, parameters, part, scene, key, count, REFINED)
+            cloud, key = item
+            crop = search_crop(cloud, 0, part.diameter, key, config)
+            return poses_in_crop(model.graphdef, parameters, part, crop, key, config).poses
 
-        return each(one, (scenes, keys))
+        return each(one, (clouds, keys))
 
-    ready = compile_for(solve, model.parameters, part, scenes, keys)
-    call = partial(ready.function, model.parameters, part, scenes, keys)
+    ready = compile_for(solve, model.parameters, part, clouds, keys)
+    call = partial(ready.function, model.parameters, part, clouds, keys)
     steady = time_in_turn({"crops": call}, repeats)["crops"]
     return {
         "batch": batch,
@@ -149,24 +158,24 @@ def crop_row(batch: int, repeats: int) -> dict[str, Any]:
         "crops/s": 1e3 * batch / steady.median_ms,
         "compile s": ready.trace_s + ready.lower_s + ready.compile_s,
         "temporary MB": ready.temporary_bytes / 1e6,
-        "converged": f"{int(call().converged.sum())} of {batch}",
+        "converged": f"{int(call().converged[:, 0].sum())} of {batch}",
     }
 
 
 def bin_row(estimator: PoseEstimator, image: BinImage, config: BinPosesConfig, repeats: int) -> dict[str, Any]:
     """Time one call, and the search in rounds, on the same image; count what each finds."""
-    model, view = estimator.model, image.scene.view
-    part = bin_part(model, image.part, estimator.probabilities.found, config)
-    sight = Sight(jnp.asarray(view.depth), intrinsics(view.camera))
+    model, scene = estimator.model, image.scene
+    search = replace(config.search, crops=config.search.crops.of_network(model.config))
+    part, calibration = device_part(model, image.part), device_calibration(estimator.probabilities.found)
+    measured = scene.image._replace(depth=jnp.asarray(scene.depth))
     inside, key = jnp.asarray(image.inside), jax.random.key(0)
-    call = partial(bin_poses, *model, part, sight, inside, key, num_points=model.config.num_scene_points, config=config)
+    config = replace(config, search=search)
+    call = partial(bin_poses, *model, part, calibration, measured, inside, key, config=config)
     found = jax.device_get(call())
     with jax.transfer_guard("disallow"):
         times = time_in_turn({"call": call}, repeats)["call"]
     poses = found.T_camera_object[found.mask & (found.probability >= estimator.config.accepted)]
-    image.scene.features.clear()
     estimator.detect(image.part, image.scene)
-    image.scene.features.clear()
     start = time.perf_counter()
     detected = estimator.detect(image.part, image.scene)
     seconds = time.perf_counter() - start

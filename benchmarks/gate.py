@@ -22,9 +22,9 @@ import tyro
 from flax import nnx
 
 from benchmarks.network_cases import Case, dense_jax_forward, head_features, make_case, match, points_in_order
-from benchmarks.stages import REFINED, network_call, small_crop
+from benchmarks.stages import SEARCH, network_call, small_crop
 from benchmarks.timing import compile_for, time_in_turn
-from kmn_jax.detection import crop_pose
+from kmn_jax.detection import poses_at
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import k_nearest, neighbor_graph, squared_distances
 from kmn_jax.models import released_object, released_scene
@@ -154,10 +154,9 @@ def pose_pair(case: Case) -> Pair:
     With all draws, so that its work is the same for any key. Not the same result, but both take the same time on every
     run, which a rival's RANSAC does not.
     """
-    model, part, scene = small_crop()
-    key, count = jax.random.key(0), model.config.num_scene_points
-    config = replace(REFINED, enough=None)
-    return Pair(lambda: crop_pose(*model, part, scene, key, count, config), _ready(dense_jax_forward, case))
+    model, part, cloud = small_crop()
+    config = replace(SEARCH.of_network(model.config), enough=None)
+    return Pair(lambda: poses_at(model, part, cloud, 0, 0, config), _ready(dense_jax_forward, case))
 
 
 def _ready(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:

@@ -21,13 +21,13 @@ from flax import nnx
 from jaxtyping import Float
 
 from benchmarks.network_cases import cached_forward, encode_objects, head_features, make_case, match
-from benchmarks.stages import small_case, small_crop
+from benchmarks.stages import SEARCH, small_case, small_crop
 from benchmarks.synthetic import synthetic_matches
 from benchmarks.timing import Compiled, compile_for, time_in_turn
 from benchmarks.training import of_batch, throughput_rows
 from configs import find_config
 from experiments.evaluation.plots import as_png, new_figure
-from kmn_jax.detection import SearchConfig, crop_features, search, seed_keys, spread_seeds
+from kmn_jax.detection import map_real, poses_in_crop, search_crop, spread_seeds
 from kmn_jax.models import load_pretrained
 from kmn_jax.objects import arrays_of, make_part, save_part
 from kmn_jax.pose import RansacConfig, ransac
@@ -161,27 +161,20 @@ def hypothesis_sweep() -> Sweep:
 
 def seed_sweep() -> Sweep:
     """Crops of one scan, from points to refined poses, over their number."""
-    model, part, scene = small_crop()
-    config = SearchConfig()
+    model, part, cloud = small_crop()
+    config = SEARCH.of_network(model.config)
 
-    def poses(parameters: nnx.State, part: Any, scene: Any, keys: Any) -> Any:
-        count = len(keys[0])
-        rows, real = spread_seeds(scene, scene.mask, count)
-        crops = crop_features(
-            model.graphdef,
-            parameters,
-            scene,
-            rows,
-            real,
-            part.diameter,
-            keys[0],
-            config=config,
-            num_points=model.config.num_scene_points,
-        )
-        return search(model.graphdef, parameters, part, crops, keys[1], config=config)
+    def poses(parameters: nnx.State, part: Any, cloud: Any, keys: Any) -> Any:
+        rows, real = spread_seeds(cloud, cloud.mask, len(keys))
 
-    keys = {count: seed_keys(jax.random.key(0), count) for count in (1, 4, 16, 64)}
-    return _sweep("crops to poses", "seeds", poses, {n: (model.parameters, part, scene, k) for n, k in keys.items()})
+        def one(row: Any, key: Any) -> Any:
+            crop = search_crop(cloud, row, part.diameter, key, config)
+            return poses_in_crop(model.graphdef, parameters, part, crop, key, config).poses
+
+        return map_real(one, real, rows, keys)
+
+    keys = {count: jax.random.split(jax.random.key(0), count) for count in (1, 4, 16, 64)}
+    return _sweep("crops to poses", "seeds", poses, {n: (model.parameters, part, cloud, k) for n, k in keys.items()})
 
 
 def device_rows(repeats: int) -> list[dict[str, Any]]:

@@ -17,9 +17,9 @@ import tyro
 
 from benchmarks.timing import compile_for, time_in_turn
 from kmn_jax.data import (
-    Crop,
     CropConfig,
     DevicePack,
+    LabelledCrop,
     NormalSource,
     Pack,
     draw_crop,
@@ -196,13 +196,13 @@ def throughput_rows(pack: DevicePack, size: int, batch: int, repeats: int) -> li
     ]
 
 
-def _crop(pack: DevicePack, config: CropConfig, splat: SplatConfig | None, key: jax.Array) -> Crop:
+def _crop(pack: DevicePack, config: CropConfig, splat: SplatConfig | None, key: jax.Array) -> LabelledCrop:
     return _crop_and_diameter(pack, config, splat, key)[0]
 
 
 def _crop_and_diameter(
     pack: DevicePack, config: CropConfig, splat: SplatConfig | None, key: jax.Array
-) -> tuple[Crop, jax.Array]:
+) -> tuple[LabelledCrop, jax.Array]:
     """Make one crop of a random object and drop."""
     object_key, drop_key, crop_key = jax.random.split(key, 3)
     item = jax.random.randint(object_key, (), 0, pack.area.shape[0])

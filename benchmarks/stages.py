@@ -21,26 +21,25 @@ from experiments.evaluation.cases import Case as PoseCase
 from experiments.evaluation.cases import draw_cases, padded
 from experiments.evaluation.sources import bop_objects
 from kmn_jax.detection import (
-    CropPoseConfig,
-    Said,
-    SceneArrays,
-    crop_for_draws,
-    crop_pose,
+    CropSearchConfig,
+    Prediction,
     draw_of_crop,
+    find_poses_in_crop,
+    poses_at,
     poses_of_draw,
+    predict,
     refined,
-    said_of_draw,
+    search_crop,
     search_draws,
     surface_scores,
 )
 from kmn_jax.errors import InputError
-from kmn_jax.geometry import neighbor_graph, space_filling_order
+from kmn_jax.geometry import PaddedCloud, neighbor_graph, space_filling_order
 from kmn_jax.models import Model, load_pretrained, released_scene
 from kmn_jax.objects import ObjectModel, PartArrays, arrays_of, make_part
-from kmn_jax.pose import IcpConfig
 
 _SMALL_SET = Path("experiments/assets/small_test_set")
-REFINED = CropPoseConfig(icp=IcpConfig(iterations=20))
+SEARCH = CropSearchConfig()  # what users run
 
 
 class Stage(NamedTuple):
@@ -61,7 +60,7 @@ class SmallCrop(NamedTuple):
 
     model: Model
     part: PartArrays
-    scene: SceneArrays
+    cloud: PaddedCloud
 
 
 def small_crop() -> SmallCrop:
@@ -114,68 +113,68 @@ def network_stages(case: Case) -> dict[str, Stage]:
     return _joined(calls, work.scene_stages(config, points))
 
 
-def pose_stages(config: CropPoseConfig = REFINED) -> dict[str, Stage]:
+def pose_stages(config: CropSearchConfig = SEARCH) -> dict[str, Stage]:
     """Return the stages from a scan to the refined pose by the released network, on a crop of the small test set."""
-    model, part, scene = small_crop()
-    key, sizes = jax.random.key(0), model.config
-    count = sizes.num_scene_points
+    model, part, cloud = small_crop()
+    key, sizes, row = jax.random.key(0), model.config, jnp.int32(0)
+    config = config.of_network(sizes)
     if config.icp is None:
         raise InputError("the stages of a crop end with its refinement: give icp")
-    icp, every = config.icp, replace(config, enough=None)
+    every, count = replace(config, enough=None), config.points_of_draw
 
-    crop_call = compile_for(lambda p, s, k: crop_for_draws(p, s, k, count, config), part, scene, key).function
-    crop = crop_call(part, scene, key)
+    crop_call = compile_for(lambda p, c, k: search_crop(c, row, p.diameter, k, config), part, cloud, key).function
+    crop = crop_call(part, cloud, key)
 
-    draw_call = compile_for(lambda c, d: draw_of_crop(c, 0, d, count, config), crop, part.diameter).function
+    draw_call = compile_for(lambda c, d: draw_of_crop(c, 0, d, config), crop, part.diameter).function
     drawn = draw_call(crop, part.diameter)
 
-    def network(parameters: nnx.State, part: Any, drawn: Any) -> Said:
-        return said_of_draw(nnx.merge(model.graphdef, parameters), part, drawn)
+    def network(parameters: nnx.State, part: Any, drawn: Any) -> Prediction:
+        return predict(nnx.merge(model.graphdef, parameters), part, drawn)
 
-    said_call = compile_for(network, model.parameters, part, drawn).function
-    draw = said_call(model.parameters, part, drawn)
+    network_call = compile_for(network, model.parameters, part, drawn).function
+    draw = network_call(model.parameters, part, drawn)
     poses_call = compile_for(lambda s, v, p, k: poses_of_draw(s, v, p, k, config), draw, crop.valid, part, key).function
     poses = poses_call(draw, crop.valid, part, key)
-    said = jax.tree.map(lambda leaf: jnp.stack([leaf] * config.num_draws), draw)
-    scores_call = compile_for(lambda f, s, c, p: surface_scores(f, s, c, p, config), poses, said, crop.seed, part)
-    searched = jax.jit(lambda c: search_draws(nnx.merge(*model[:2]), part, c, key, count, config))(crop)
+    draws = jax.tree.map(lambda leaf: jnp.stack([leaf] * config.num_draws), draw)
+    scores_call = compile_for(lambda f, s, c, p: surface_scores(f, s, c, p, config), poses, draws, crop.seed, part)
+    searched = jax.jit(lambda c: search_draws(nnx.merge(*model), part, c, key, config))(crop)
     made = int(searched.num_draws)
-    best = int(jnp.argmax(scores_call.function(poses, said, crop.seed, part)))
-    pose = jax.tree.map(lambda leaf: leaf[best], poses)
-    icp_call = compile_for(lambda f, s, p: refined(f, s, p, icp), pose, draw, part).function
+    best = int(jnp.argmax(scores_call.function(poses, draws, crop.seed, part)))
+    pose = poses.T_scene_object[best]
+    icp_call = compile_for(lambda f, s, p: refined(f, s, p, config), pose, draw, part).function
     calls = {
-        "crop": lambda: crop_call(part, scene, key),
+        "crop": lambda: crop_call(part, cloud, key),
         "a draw, smoothed, with normals": lambda: draw_call(crop, part.diameter),
-        "network on a draw": lambda: said_call(model.parameters, part, drawn),
+        "network on a draw": lambda: network_call(model.parameters, part, drawn),
         "matches and RANSAC of a draw": lambda: poses_call(draw, crop.valid, part, key),
-        "a draw's poses against the surface": lambda: scores_call.function(poses, said, crop.seed, part),
+        "a draw's poses against the surface": lambda: scores_call.function(poses, draws, crop.seed, part),
         "ICP": lambda: icp_call(pose, draw, part),
-        "crop to refined pose, all draws": lambda: crop_pose(*model, part, scene, key, count, every),
-        "crop to refined pose": lambda: crop_pose(*model, part, scene, key, count, config),
+        "crop to refined poses, all draws": lambda: find_poses_in_crop(*model, part, crop, key, every),
+        "crop to refined poses": lambda: poses_at(model, part, cloud, 0, 0, config),
     }
-    draws, kept = config.num_draws, max(config.num_draws * (count - 1) + 1, config.normal_points)
+    kept = max(config.num_draws * (count - 1) + 1, config.crop_points)
     pairs = min(config.matches.capacity, count * sizes.num_keypoints)
     search = work.matches(count, sizes.num_keypoints, config.matches) + work.ransac(
         pairs, config.num_modes, config.ransac
     )
     of_stage = {
-        "crop": work.drawn_crop(len(scene.points), kept, 0),
+        "crop": work.drawn_crop(len(cloud.points), kept, 0),
         "a draw, smoothed, with normals": work.drawn_crop(0, kept, count),
         "network on a draw": work.total(work.scene_stages(sizes, count).values()),
         "matches and RANSAC of a draw": search,
         "a draw's poses against the surface": work.surface_scores(
-            config.num_modes, config.surface_points, draws * count
+            config.num_modes, config.surface_points, config.num_draws * count
         ),
-        "ICP": work.icp(len(part.points), count, icp),
+        "ICP": work.icp(len(part.points), config.icp_points, config.icp),
     }
-    first, *of_draw, last = of_stage.values()
-    draw_work = work.total(of_draw)
+    first, *of_draw, refining = of_stage.values()
+    draw_work, last = work.total(of_draw), refining.times(config.num_poses)
     return _joined(
         calls,
         of_stage
         | {
-            "crop to refined pose, all draws": first + draw_work.times(draws) + last,
-            "crop to refined pose": first + draw_work.times(made) + last,
+            "crop to refined poses, all draws": first + draw_work.times(config.num_draws) + last,
+            "crop to refined poses": first + draw_work.times(made) + last,
         },
     )
 
