@@ -41,7 +41,7 @@ ScanSource: TypeAlias = str | Path | np.ndarray | Scan
 _UNFITTED = "the probabilities were fitted for other weights: fit them with experiments.calibrate"
 _NUM_POINTS = 4096  # on a part's surface
 _CARD = ".kmn"
-_MOST_SEED = 2**31 - 1
+_MOST_SEED = 2**32 - 1
 _SAME_SIZE = 0.03  # between the lengths of a part and of the same one in a dataset
 
 

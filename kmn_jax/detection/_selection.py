@@ -65,7 +65,7 @@ def select(
 
     kept, clash = _greedy(score, one_each, clashing)
     # A pose that a better one has ruled out elsewhere is no rival here.
-    better = clash & (score[:, None] > score[None])
+    better = (clash & (score[:, None] > score[None])).astype(jnp.int32)
     alone = better.sum(axis=0)[None] == better
     beaten = one_each & ~kept
     gap = score - jnp.where(clash & beaten[None] & alone, score[None], 0).max(axis=1, initial=0)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from kmn_jax.detection import CropPrediction, Detection, Detections, View, view_of
-from kmn_jax.detection._result import Timing
+from kmn_jax.detection import CropPrediction, Detection, Detections, Scene, Timing, make_scene
 from kmn_jax.geometry import Camera, farthest_point_indices
 from kmn_jax.io import Scan
 from kmn_jax.objects import Part, Symmetries
@@ -17,7 +16,7 @@ CAMERA = Camera(150.0, 150.0, 79.5, 59.5, 160, 120)
 SIZES = (1.0, 0.7, 0.4)  # of a box along x, y and z
 WALL = 3.5  # its distance
 FRONT = 2.8  # that of the boxes' fronts
-POSES = (pose((-0.75, 0.0, 3.0)), pose((0.75, 0.0, 3.0)))  # T_view_object, the boxes float before the wall
+POSES = (pose((-0.75, 0.0, 3.0)), pose((0.75, 0.0, 3.0)))  # T_camera_object, the boxes float before the wall
 
 
 def box_part(keypoints: int = 8, unit: str = "m") -> Part:
@@ -41,7 +40,7 @@ def box_part(keypoints: int = 8, unit: str = "m") -> Part:
     )
 
 
-def box_view() -> View:
+def box_view() -> Scene:
     """Return the depth image of the boxes in front of the wall."""
     rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
     x, y = (columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy
@@ -52,18 +51,19 @@ def box_view() -> View:
         near, far = np.minimum(low / rays, high / rays).max(axis=2), np.maximum(low / rays, high / rays).min(axis=2)
         z = np.where(near < far, np.minimum(z, near), z)
     points = (rays * z[..., None]).reshape(-1, 3).astype(np.float32)
-    return view_of(Scan(points, None, z.astype(np.float32), CAMERA, "m"))
+    scan = Scan(points, None, z.astype(np.float32), CAMERA, "m")
+    return make_scene(scan, box_part().diameter, inside=np.ones(len(points), dtype=bool))
 
 
-def crop_of(part: Part, view: View, T: np.ndarray) -> CropPrediction:
-    """Return a crop around the front of a box, with true predictions; points are in the view's frame."""
+def crop_of(part: Part, view: Scene, T: np.ndarray) -> CropPrediction:
+    """Return a crop around the front of a box, with true predictions; points are in the camera's frame."""
     seed = T[:3, 3] - [0, 0, SIZES[2] / 2]
     points = view.points[np.linalg.norm(view.points - seed, axis=1) < 1.3]
     on = (np.abs(points - T[:3, 3]) < np.array(SIZES) / 2 + 1e-3).all(axis=1) & (points[:, 2] < WALL - 1e-3)
     return CropPrediction(points, on, nearest_keypoint(part, points.astype(np.float64) - T[:3, 3]))
 
 
-def detection(part: Part, view: View, T: np.ndarray, probability: float, warnings: tuple[str, ...] = ()) -> Detection:
+def detection(part: Part, view: Scene, T: np.ndarray, probability: float, warnings: tuple[str, ...] = ()) -> Detection:
     return Detection(
         T_scene_object=T,
         probability=probability,
@@ -80,7 +80,7 @@ def detection(part: Part, view: View, T: np.ndarray, probability: float, warning
     )
 
 
-def both_boxes(part: Part, view: View) -> Detections:
+def both_boxes(part: Part, view: Scene) -> Detections:
     """Return the left box as likely, the right one as not."""
     poses = (
         detection(part, view, POSES[0], 0.93),

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,15 +15,15 @@ from kmn_jax.detection import (
     DetectConfig,
     ForegroundOptions,
     PoseEstimator,
-    Seeds,
     as_json,
+    canonical_pose,
+    device_part,
     export_estimator,
-    find_candidates,
+    search_at,
     seeds_over,
     symmetry_transforms,
     table,
 )
-from kmn_jax.detection._detect import canonical_pose
 from kmn_jax.errors import InputError
 from kmn_jax.io import Scan
 from kmn_jax.objects import Part, save_part
@@ -111,37 +110,38 @@ def test_places_and_crops_give_the_pose_there(estimator: PoseEstimator, motor: P
     seed = max(whole.poses, key=lambda pose: pose.probability).seed
     there = estimator.detect(motor, scan, at=seed, top=1)
     assert errors(there.poses[0].T_scene_object, truth, motor).min() < 0.1
-    near = np.linalg.norm(scan.points - seed, axis=1) < motor.diameter
-    crop = np.concatenate([seed[None], scan.points[near]]).astype(np.float32)
-    single = estimator.estimate(motor, crop)
-    several = estimator.estimate(motor, [crop, crop[:400]])
-    assert len(several) == 2
-    assert errors(single.poses[0].T_scene_object, truth, motor).min() < 0.1
-    np.testing.assert_array_equal(several[0].poses[0].T_scene_object, single.poses[0].T_scene_object)
+    other = scan.points[len(scan.points) // 2]
+    both = estimator.detect(motor, scan, at=np.stack([seed, other]))
+    assert len(both.poses) <= 2
+    poses = np.stack([pose.T_scene_object for pose in both.poses])
+    assert (poses == there.poses[0].T_scene_object).all(axis=(1, 2)).any(), (
+        "a place has its pose whatever else is asked"
+    )
 
 
-def test_parts_of_one_size_share_the_features_of_a_scene(estimator: PoseEstimator, motor: Part) -> None:
+def test_several_parts_share_a_scene(estimator: PoseEstimator, motor: Part) -> None:
     scan, _ = bin_of(0)
     scene = estimator.scene(scan, motor)
     twin = replace(motor, name="twin", diameter=motor.diameter * 1.0001)
     first, second = estimator.detect([motor, twin], scene)
     assert (first.part, second.part) == ("gear_motor", "twin")
-    length = {name[3] for name in scene.features}
-    assert len(length) == 1
     assert abs(len(first.poses) - len(second.poses)) <= 2
+    assert estimator.detect([], scene) == ()
 
 
-def test_seeds_are_spread_and_the_others_not_searched(estimator: PoseEstimator, motor: Part) -> None:
+def test_candidates_have_evidence_and_some_are_right(estimator: PoseEstimator, motor: Part) -> None:
     scan, truth = bin_of(0)
     scene = estimator.scene(scan, motor)
-    config = DetectConfig().candidates
-    seeds = seeds_over(scene, scene.foreground, motor, config)
-    few = Seeds(seeds.rows, seeds.real & (jnp.arange(len(seeds.real)) < 16))
-    found = find_candidates(estimator.model, motor, scene, few, 0, config)
-    assert found.evidence.shape == (16 * config.search.num_modes, len(EVIDENCE))
+    config = DetectConfig().search
+    config = replace(config, crops=config.crops.of_network(estimator.model.config))
+    rows = seeds_over(scene, scene.foreground, motor)[:16]
+    found = search_at(estimator.model, device_part(estimator.model, motor), scene, rows, 0, config)
+    assert found.evidence.shape == (16 * config.crops.num_poses, len(EVIDENCE))
     assert np.isfinite(found.evidence).all()
-    right = [errors(pose, truth, motor).min() < 0.1 for pose in found.T_view_object[found.usable]]
-    assert np.mean(right) > 0.3
+    assert found.is_first.sum() == 16
+    first = found.usable & found.is_first
+    right = [errors(pose, truth, motor).min() < 0.1 for pose in found.T_camera_object[first]]
+    assert np.mean(right) > 0.5
 
 
 @pytest.mark.parametrize("mesh", [box(40, 20, 10), revolution([(0, 0), (8, 0), (8, 30), (0, 30)])])
@@ -173,12 +173,16 @@ def test_what_cannot_be_is_one_sentence(estimator: PoseEstimator, motor: Part, t
         estimator.prepare({})
     with pytest.raises(InputError, match="must be \\(n, 3\\)"):
         estimator.prepare(np.zeros((5, 2)))
-    with pytest.raises(InputError, match="seed is -1, but must be between 0"):
-        estimator.detect(motor, scan, seed=-1)
+    with pytest.raises(InputError, match="random_seed is -1, but must be between 0"):
+        estimator.detect(motor, scan, random_seed=-1)
     with pytest.raises(InputError, match=r"place 2 to search at is .* mm away from the nearest measured point"):
         estimator.detect(motor, scan, at=np.stack([scan.points[0], [9000.0, 0, 0]]))
     with pytest.raises(InputError, match="leave the sensor's place out"):
         estimator.detect(motor, scan, sensor=np.zeros(3))
+    with pytest.raises(InputError, match="were settled when the scene was made"):
+        estimator.detect(motor, estimator.scene(scan, motor), unit="mm")
+    with pytest.raises(InputError, match="no part is given"):
+        estimator.scene(scan, [])
     save_part(motor, tmp_path / "motor.kmn")
     assert estimator.prepare(tmp_path / "motor.kmn", "mm").unit == "mm"
     with pytest.raises(InputError, match="says that its lengths are mm, not m: make the card again"):

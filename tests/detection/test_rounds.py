@@ -4,117 +4,108 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from kmn_jax.detection import (
     EVIDENCE,
+    NUM_SEEDS,
     THOROUGH,
     Calibration,
-    CandidateConfig,
-    CropFeatures,
+    Candidates,
+    Clock,
+    CoverageConfig,
+    CropPoses,
     DetectConfig,
-    Detections,
-    Hypotheses,
-    Predictions,
-    Probabilities,
+    Prediction,
     Scene,
-    Solver,
-    detect,
-    make_scene,
+    candidates_of,
+    explore,
     seeds_over,
 )
-from kmn_jax.detection._candidates import NUM_SEEDS
-from kmn_jax.detection._coverage import CoverageConfig
+from kmn_jax.detection._seeds import SPACING
 from kmn_jax.errors import InputError
-from kmn_jax.models import Model, create_model
-from kmn_jax.objects import Part
-from kmn_jax.typing import PRNGKey
+from kmn_jax.pose import PoseResult
 from tests.detection.box_sample import box_part, box_view
-from tests.reference.networks import TINY
 
 SURE = Calibration(EVIDENCE, (0.0,) * len(EVIDENCE), 3.0)
 QUICK = DetectConfig()
 DIAMETER = 0.8
 
 
-@pytest.fixture(scope="module")
-def model() -> Model:
-    return create_model(TINY, jax.random.key(0))
+PART = replace(box_part(), diameter=DIAMETER)
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    view = box_view()
-    return make_scene(view, "m", np.ones(len(view.points), dtype=bool), 131_072)
+    return box_view()
 
 
-def answering(found_from: int, real: list[np.ndarray]) -> Solver:
-    """Return a solver that remembers the seeds it was asked for and finds a part at each until some round."""
+def answer(scene: Scene, rows: np.ndarray, there: bool) -> Candidates:
+    """Return a pose at each seed, or none."""
+    count = len(rows)
+    poses = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1, 1))
+    poses[:, 0, :3, 3] = scene.points[rows]
+    columns = np.zeros((count, 1), dtype=np.float32)
+    found = np.full((count, 1), there)
+    result = PoseResult(poses, columns, columns, columns, np.zeros((count, 1, 1), bool), found, columns)
+    points = np.zeros((count, 4, 3), np.float32)
+    prediction = Prediction(points, points, points[..., 0] == 0, points[..., :2], points)
+    crops = CropPoses(result, columns, prediction, scene.points[rows], np.ones(count, bool))
+    return candidates_of(crops, np.zeros((count, 1, len(EVIDENCE)), np.float32), rows)
 
-    def solve(part: Part, scene: Scene, crops: CropFeatures, key: PRNGKey) -> tuple[Hypotheses, Predictions]:
-        valid = np.asarray(crops.valid)
-        real.append(np.asarray(crops.seed)[valid])
-        there = jnp.asarray(valid & (len(real) < found_from))[:, None]
-        poses = jnp.tile(jnp.eye(4), (len(valid), 1, 1, 1)).at[:, 0, :3, 3].set(crops.seed)
-        size = crops.mask.shape[1]
-        said = Predictions(crops.mask, jnp.zeros((len(valid), size, len(part.features))))
-        return Hypotheses(poses, there, there.astype(jnp.int32), there.astype(jnp.float32)), said
 
-    return solve
-
-
-def rounds(model: Model, scene: Scene, found_from: int, config: DetectConfig) -> tuple[list[np.ndarray], Detections]:
+def rounds(scene: Scene, found_from: int, config: DetectConfig) -> tuple[list[np.ndarray], tuple[str, ...]]:
+    """Return the seeds of each round, of which those before `found_from` find a part at each, and warnings."""
     asked: list[np.ndarray] = []
-    solver = answering(found_from, asked)
-    small = replace(box_part(), diameter=DIAMETER)
-    return asked, detect(model, Probabilities(SURE, SURE), small, scene, 0, config, solver=solver)
+
+    def propose(rows: np.ndarray) -> Candidates:
+        asked.append(scene.points[rows])
+        return answer(scene, rows, len(asked) < found_from)
+
+    _, warnings = explore(scene, PART, propose, SURE, config, Clock())
+    return asked, warnings
 
 
 def nearest_seeds(asked: list[np.ndarray], scene: Scene) -> np.ndarray:
     return np.linalg.norm(scene.points[::50, None] - np.concatenate(asked)[None], axis=2).min(axis=1)
 
 
-def test_a_bin_is_searched_until_a_seed_is_near_to_all_of_it(model: Model, scene: Scene) -> None:
-    asked, found = rounds(model, scene, 0, THOROUGH)
+def test_a_bin_is_searched_until_a_seed_is_near_to_all_of_it(scene: Scene) -> None:
+    asked, found = rounds(scene, 0, THOROUGH)
     assert len(asked[0]) == NUM_SEEDS
     assert max(len(seeds) for seeds in asked[1:]) == THOROUGH.later_seeds
     seeds = np.concatenate(asked)
     apart = np.linalg.norm(seeds[:, None] - seeds[None], axis=2)[np.triu_indices(len(seeds), 1)]
     assert apart.min() > THOROUGH.coverage.searched_finely * DIAMETER
     # But for a few stray points, and what is between the spacing of seeds and the reach of one.
-    assert np.mean(nearest_seeds(asked, scene) <= CandidateConfig().seed_spacing * DIAMETER) > 0.98
-    assert not found.warnings
-    assert found.reason is not None
-    assert f"any of the {len(seeds)} places" in found.reason
+    assert np.mean(nearest_seeds(asked, scene) <= SPACING * DIAMETER) > 0.98
+    assert not found
 
 
-def test_where_nothing_is_found_it_is_searched_coarsely(model: Model, scene: Scene) -> None:
-    fine, coarse = (rounds(model, scene, 0, config)[0] for config in (THOROUGH, QUICK))
+def test_where_nothing_is_found_it_is_searched_coarsely(scene: Scene) -> None:
+    fine, coarse = (rounds(scene, 0, config)[0] for config in (THOROUGH, QUICK))
     assert len(np.concatenate(coarse)) < len(np.concatenate(fine))
     assert np.mean(nearest_seeds(coarse, scene) <= 1.1 * QUICK.coverage.searched * DIAMETER) > 0.98
     assert np.isin(np.concatenate(coarse), np.concatenate(fine)).all()  # it only ends earlier
 
 
-def test_a_search_that_is_given_up_says_so(model: Model, scene: Scene) -> None:
-    asked, found = rounds(model, scene, 0, DetectConfig(most_seeds=40, later_seeds=5))
+def test_a_search_that_is_given_up_says_so(scene: Scene) -> None:
+    asked, found = rounds(scene, 0, DetectConfig(most_seeds=40, later_seeds=5))
     assert [len(seeds) for seeds in asked] == [NUM_SEEDS, 5, 5]
-    assert "of the foreground was not searched" in found.warnings[0]
+    assert "of the foreground was not searched" in found[0]
 
 
-def test_likely_poses_cover_what_they_explain(model: Model, scene: Scene) -> None:
-    nothing, something = (rounds(model, scene, until, THOROUGH)[0] for until in (0, 99))
+def test_likely_poses_cover_what_they_explain(scene: Scene) -> None:
+    nothing, something = (rounds(scene, until, THOROUGH)[0] for until in (0, 99))
     assert len(np.concatenate(something)) < len(np.concatenate(nothing))
 
 
 def test_seeds_are_no_more_than_asked_for_or_needed(scene: Scene) -> None:
-    config, part = CandidateConfig(), replace(box_part(), diameter=DIAMETER)
-    assert int(seeds_over(scene, scene.foreground, part, config, 7).real.sum()) == 7
+    assert len(seeds_over(scene, scene.foreground, PART, 7)) == 7
     one_point = np.zeros_like(scene.foreground)
     one_point[0] = True
-    assert int(seeds_over(scene, one_point, part, config).real.sum()) == 1
+    assert len(seeds_over(scene, one_point, PART)) == 1
 
 
 @pytest.mark.parametrize(

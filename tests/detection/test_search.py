@@ -1,4 +1,4 @@
-"""The search as a function of scene, seeds and key: spread, padding, determinism; nothing is ever NaN."""
+"""Seeds, and the search as a function of scene, seeds and random seed: spread, determinism; nothing is ever NaN."""
 
 from __future__ import annotations
 
@@ -9,11 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.detection import EVIDENCE, SceneArrays, SearchConfig, Sight, crop_features, search, seed_keys, spread_seeds
-from kmn_jax.detection._evidence import evidence_of
-from kmn_jax.detection._search import spread_rows
-from kmn_jax.detection._verify import VerifyConfig, depth_buffer
-from kmn_jax.geometry import Intrinsics
+from kmn_jax.detection import (
+    EVIDENCE,
+    Candidates,
+    CropSearchConfig,
+    DevicePart,
+    Scene,
+    SearchConfig,
+    make_scene,
+    search_at,
+    spread_seeds,
+)
+from kmn_jax.geometry import PaddedCloud, spread_rows
+from kmn_jax.io import Scan
 from kmn_jax.models import Model, create_model, encode_object
 from kmn_jax.objects import PartArrays
 from kmn_jax.pose import RansacConfig
@@ -22,7 +30,10 @@ from tests.reference.clouds import box_cloud
 from tests.reference.networks import TINY
 
 NETWORK = replace(TINY, num_keypoints=6)
-CONFIG = SearchConfig(ransac=RansacConfig(num_hypotheses=50, num_candidates=200), normal_points=256)
+CROPS = CropSearchConfig(
+    num_points=64, num_draws=2, crop_points=256, ransac=RansacConfig(num_hypotheses=50, num_candidates=200)
+)
+CONFIG = SearchConfig(CROPS)
 
 
 @pytest.fixture(scope="module")
@@ -31,102 +42,93 @@ def model() -> Model:
 
 
 @pytest.fixture(scope="module")
-def part(model: Model) -> PartArrays:
+def part(model: Model) -> DevicePart:
     cloud = box_cloud(0, 128).astype(np.float32)
     features = encode_object(model, cloud[:64], np.arange(6), np.float32(2)).features
-    return PartArrays(jnp.asarray(cloud[:64, :3]), jnp.asarray(cloud[:64, 3:]), features, jnp.float32(2))
+    points, normals = jnp.asarray(cloud[:64, :3]), jnp.asarray(cloud[:64, 3:])
+    arrays = PartArrays(points, normals, features, jnp.float32(2))
+    return DevicePart(arrays, Surfels(points, normals, jnp.float32(10)), jnp.eye(4)[None], jnp.float32(0.2))
 
 
-def scene(count: int = 700, capacity: int = 1024, seed: int = 0) -> SceneArrays:
-    rng = np.random.default_rng(seed)
-    points = np.zeros((capacity, 3), dtype=np.float32)
-    points[:count] = rng.uniform(-2, 2, (count, 3)) * [1, 1, 0.2] + [0, 0, 6]
-    return SceneArrays(jnp.asarray(points), jnp.arange(capacity) < count)
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    rng = np.random.default_rng(0)
+    points = (rng.uniform(-2, 2, (700, 3)) * [1, 1, 0.2] + [0, 0, 6]).astype(np.float32)
+    return scene_of(points)
 
 
-def run(
-    model: Model, part: PartArrays, where: SceneArrays, seeds: list[int], real: int | None = None
-) -> dict[str, jax.Array]:
-    """Return the fields of hypotheses and predictions, and the evidence."""
-    rows, flags = jnp.asarray(seeds, "i4"), jnp.arange(len(seeds)) < (len(seeds) if real is None else real)
-    one, other = seed_keys(jax.random.key(0), len(seeds))
-    crops = crop_features(
-        model.graphdef, model.parameters, where, rows, flags, part.diameter, one, CONFIG, num_points=64
-    )
-    found, said = search(model.graphdef, model.parameters, part, crops, other, CONFIG)
-    surfels = Surfels(part.points, part.normals, jnp.float32(10))
-    camera = Intrinsics(*(jnp.float32(number) for number in (50, 50, 32, 32, 64, 64)))
-    sight = Sight(depth_buffer(where.points, where.mask, camera, (64, 64)), camera)
-    proof = evidence_of(found, said, crops, part, surfels, sight, VerifyConfig())
-    return found._asdict() | said._asdict() | {"evidence": proof}
+def scene_of(points: np.ndarray) -> Scene:
+    return make_scene(Scan(points, None, None, None, "m"), 2.0, inside=np.ones(len(points), dtype=bool))
 
 
-def test_seeds_are_candidates_far_from_each_other() -> None:
-    where = scene()
-    candidates = jnp.asarray(np.asarray(where.points)[:, 0] > 0)
-    found, real = spread_seeds(where, candidates, 12)
+def run(model: Model, part: DevicePart, scene: Scene, rows: list[int], random_seed: int = 0) -> Candidates:
+    return search_at(model, part, scene, np.array(rows), random_seed, CONFIG)
+
+
+def test_seeds_are_candidates_far_from_each_other(scene: Scene) -> None:
+    cloud = scene.cloud
+    candidates = jnp.asarray(np.asarray(cloud.points)[:, 0] > 0)
+    found, real = jax.jit(spread_seeds, static_argnums=2)(cloud, candidates, 12)
     seeds = np.asarray(found)
     assert bool(real.all())
     assert bool(candidates[seeds].all())
-    assert bool(where.mask[seeds].all())
-    points = np.asarray(where.points)[seeds]
+    assert bool(cloud.mask[seeds].all())
+    points = np.asarray(cloud.points)[seeds]
     apart = np.linalg.norm(points[:, None] - points[None], axis=2)[~np.eye(12, dtype=bool)]
-    chosen = np.asarray(where.points)[np.flatnonzero(candidates & where.mask)]
+    chosen = np.asarray(cloud.points)[np.flatnonzero(candidates & cloud.mask)]
     holes = np.linalg.norm(chosen[:, None] - points[None], axis=2).min(axis=1).max()
     assert apart.min() >= 0.9 * holes
 
 
-def test_few_candidates_come_again_and_are_told() -> None:
-    where = scene()
-    candidates = jnp.zeros(1024, dtype=bool).at[jnp.array([3, 500])].set(True)
-    seeds, real = spread_seeds(where, candidates, 5)
+def test_few_candidates_come_again_and_are_told(scene: Scene) -> None:
+    capacity = len(scene.cloud.mask)
+    candidates = jnp.zeros(capacity, dtype=bool).at[jnp.array([3, 500])].set(True)
+    seeds, real = spread_seeds(scene.cloud, candidates, 5)
     assert set(np.asarray(seeds).tolist()) == {3, 500}
     assert set(np.asarray(seeds)[np.asarray(real)].tolist()) == {3, 500}
     assert int(real.sum()) == 2
-    assert not bool(spread_seeds(where, jnp.zeros(1024, dtype=bool), 5)[1].any())
+    assert not bool(spread_seeds(scene.cloud, jnp.zeros(capacity, dtype=bool), 5)[1].any())
 
 
-def test_hypotheses_are_finite_and_those_of_their_key(model: Model, part: PartArrays) -> None:
-    where = scene()
-    found, again = (run(model, part, where, [0, 10, 200]) for _ in range(2))
-    for name, value in found.items():
-        assert value.shape[0] == 3
-        assert bool(jnp.isfinite(value).all()), name
-        np.testing.assert_array_equal(value, again[name])
-    assert np.allclose(np.linalg.det(np.asarray(found["T_scene_object"])[..., :3, :3]), 1, atol=1e-4)
-    np.testing.assert_allclose(found["scores"].sum(axis=2), 1, atol=1e-4)
-    evidence = dict(zip(EVIDENCE, np.moveaxis(np.asarray(found["evidence"]), 2, 0), strict=True))
+def test_candidates_are_finite_and_those_of_their_seed(model: Model, part: DevicePart, scene: Scene) -> None:
+    found, again = (run(model, part, scene, [0, 10, 200]) for _ in range(2))
+    jax.tree.map(np.testing.assert_array_equal, found, again)
+    alone = run(model, part, scene, [10])
+    own = found.crop == 1
+    np.testing.assert_array_equal(found.T_camera_object[own], alone.T_camera_object)
+    np.testing.assert_array_equal(found.evidence[own], alone.evidence)
+    assert len(found.usable) == 3 * CROPS.num_poses
+    for leaf in (found.T_camera_object, found.evidence, *found.found.prediction):
+        assert np.isfinite(leaf).all()
+    np.testing.assert_allclose(np.linalg.det(found.T_camera_object[:, :3, :3]), 1, atol=1e-4)
+    np.testing.assert_array_equal(
+        found.T_camera_object[~found.usable], np.eye(4)[None].repeat((~found.usable).sum(), 0)
+    )
+    evidence = dict(zip(EVIDENCE, found.evidence.T, strict=True))
     total = sum(evidence[name] for name in ("explained", "violated", "occluded", "unknown"))
     assert ((np.abs(total - 1) < 1e-3) | (total == 0)).all()  # nothing of a pose behind the sensor is visible
-    for name in set(EVIDENCE) - {"log_inliers", "straight"}:
+    for name in set(EVIDENCE) - {"log_inliers", "straight", "surface"}:
         assert (evidence[name] >= 0).all(), name
         assert (evidence[name] <= 1.001).all(), name
+    assert (np.abs(evidence["surface"]) <= 3).all()
+    scores = np.where(np.isfinite(found.found.scores), found.found.scores, -9)
+    assert (np.diff(scores, axis=1) <= 0).all(), "the best pose of a crop comes first"
 
 
-def test_a_seed_among_nothing_gives_no_pose(model: Model, part: PartArrays) -> None:
-    points = jnp.zeros((1024, 3)).at[:, 2].set(1.0).at[0].set(jnp.array([50.0, 0, 1]))
-    found = run(model, part, SceneArrays(points, jnp.arange(1024) < 1), [0, 0, 0])
-    assert not bool(found["found"].any())
-    assert bool(jnp.isfinite(found["T_scene_object"]).all())
-    assert bool(jnp.isfinite(found["evidence"]).all())
+def test_a_seed_among_nothing_gives_no_pose(model: Model, part: DevicePart) -> None:
+    lonely = np.random.default_rng(0).uniform([-1, -1, 59], [1, 1, 61], (51, 3))
+    lonely[0] = [50, 0, 60]
+    found = run(model, part, scene_of(lonely.astype(np.float32)), [0])
+    assert not found.usable.any()
+    assert np.isfinite(found.T_camera_object).all()
+    np.testing.assert_array_equal(found.evidence, np.zeros_like(found.evidence))
 
 
-def test_seeds_that_are_not_real_are_skipped(model: Model, part: PartArrays) -> None:
-    all_three, first_two = (run(model, part, scene(), [5, 9, 60], real) for real in (3, 2))
-    assert bool((all_three["scores"][2] > 0).any())
-    assert not bool(first_two["found"][2].any())
-    assert not bool(first_two["on_object"][2].any())
-    np.testing.assert_array_equal(first_two["T_scene_object"][2], np.tile(np.eye(4), (CONFIG.num_modes, 1, 1)))
-    for name, value in all_three.items():
-        np.testing.assert_array_equal(value[:2], first_two[name][:2])
-
-
-def test_padding_changes_nothing(model: Model, part: PartArrays) -> None:
-    where = scene()
-    rubbish = jnp.where(where.mask[:, None], where.points, 6.0)
-    one, other = (run(model, part, where._replace(points=points), [5, 9, 60]) for points in (where.points, rubbish))
-    for name, value in one.items():
-        np.testing.assert_array_equal(value, other[name])
+def test_padding_changes_nothing(model: Model, part: DevicePart, scene: Scene) -> None:
+    cloud = scene.cloud
+    rubbish = PaddedCloud(jnp.where(cloud.mask[:, None], cloud.points, 6.0), cloud.mask)
+    one, other = (run(model, part, replace(scene, cloud=points), [5, 9]) for points in (cloud, rubbish))
+    jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 @pytest.mark.parametrize(("total", "count"), [(5, 8), (700, 512), (307_200, 32_768), (1_900_000, 40_000)])

@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.detection._verify import Agreement, VerifyConfig, agreement, depth_buffer
+from kmn_jax.detection import DepthAgreement, DepthAgreementConfig, DepthImage, depth_agreement, depth_buffer
 from kmn_jax.geometry import Intrinsics, transform_points
 from kmn_jax.simulate import Surfels
 from tests.reference.meshes import pose, random_rotations
 
 CAMERA = Intrinsics(*(jnp.float32(value) for value in (200.0, 200.0, 80.0, 60.0, 160, 120)))
 SHAPE = (120, 160)
-CONFIG = VerifyConfig()
-check = jax.jit(agreement, static_argnames="config")
+CONFIG = DepthAgreementConfig()
+check = jax.jit(depth_agreement, static_argnames="config")
 
 
 def cube(count: int, seed: int) -> tuple[jax.Array, jax.Array]:
@@ -44,8 +44,8 @@ def moved(x: float, y: float, z: float) -> jax.Array:
     return jnp.asarray(TRUE).at[:3, 3].add(jnp.array([x, y, z], dtype=jnp.float32))
 
 
-def of(T: jax.Array, depth: jax.Array) -> Agreement:
-    found: Agreement = check(T, SURFELS, depth, CAMERA, DIAMETER, config=CONFIG)
+def of(T: jax.Array, depth: jax.Array) -> DepthAgreement:
+    found: DepthAgreement = check(T, SURFELS, DepthImage(depth, CAMERA), DIAMETER, config=CONFIG)
     np.testing.assert_allclose(sum(found), 1, atol=1e-5)
     return found
 
@@ -85,5 +85,5 @@ def test_a_wall_behind_contradicts_a_pose_in_the_air(depth: jax.Array) -> None:
 
 
 def test_behind_the_camera_nothing_is_known(depth: jax.Array) -> None:
-    found = check(moved(0, 0, -10), SURFELS, depth, CAMERA, DIAMETER, config=CONFIG)
+    found = check(moved(0, 0, -10), SURFELS, DepthImage(depth, CAMERA), DIAMETER, config=CONFIG)
     assert [float(part) for part in found] == [0, 0, 0, 0, 0]

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.detection._contour import Contour, contour
-from kmn_jax.detection._verify import VerifyConfig
+from kmn_jax.detection import DepthAgreementConfig, DepthImage, OutlineAgreement, outline_agreement
 from kmn_jax.geometry import intrinsics
 from kmn_jax.simulate import Surfels
 from tests.detection.box_sample import CAMERA, POSES, SIZES, WALL, box_part, box_view
@@ -16,7 +15,7 @@ from tests.reference.meshes import pose
 
 PART = box_part()
 SURFELS = Surfels(jnp.asarray(PART.points), jnp.asarray(PART.normals), jnp.float32(PART.area))
-compare = jax.jit(contour, static_argnames="config")
+compare = jax.jit(outline_agreement, static_argnames="config")
 
 
 @pytest.fixture(scope="module")
@@ -26,14 +25,13 @@ def depth() -> jax.Array:
     return jnp.asarray(image)
 
 
-def of(T: np.ndarray, depth: jax.Array) -> Contour:
-    found: Contour = compare(
+def of(T: np.ndarray, depth: jax.Array) -> OutlineAgreement:
+    found: OutlineAgreement = compare(
         jnp.asarray(T, dtype=jnp.float32),
         SURFELS,
-        depth,
-        intrinsics(CAMERA),
+        DepthImage(depth, intrinsics(CAMERA)),
         jnp.float32(PART.diameter),
-        config=VerifyConfig(),
+        config=DepthAgreementConfig(),
     )
     assert 0 <= found.open <= found.open + found.level <= 1 + 1e-6
     return found
@@ -89,10 +87,11 @@ def test_holes_have_an_outline(depth: jax.Array) -> None:
     rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
     away = np.hypot(columns - CAMERA.cx, rows - CAMERA.cy) / CAMERA.fx * 3
     hole = jnp.where(jnp.asarray(away) < 0.3, 4.0, through)
-    arguments = (surfels, intrinsics(CAMERA), jnp.float32(2**0.5))
+    camera, diameter = intrinsics(CAMERA), jnp.float32(2**0.5)
     T = jnp.asarray(pose((0.0, 0.0, 3.0)), dtype=jnp.float32)
     closed, opened = (
-        compare(T, arguments[0], image, *arguments[1:], config=VerifyConfig()) for image in (through, hole)
+        compare(T, surfels, DepthImage(image, camera), diameter, config=DepthAgreementConfig())
+        for image in (through, hole)
     )
     assert closed.open == 0
     assert 0.2 < opened.open < 0.5  # two pi 0.3 of it and 4

@@ -11,8 +11,19 @@ import pytest
 
 import experiments
 from kmn_jax.bop import bop_scan
-from kmn_jax.detection import BinPosesConfig, PoseEstimator, Sight, bin_part, bin_poses
-from kmn_jax.detection._bin_poses import BinPart, BinPoses
+from kmn_jax.detection import (
+    BinPoses,
+    BinPosesConfig,
+    CropSearchConfig,
+    DepthImage,
+    DeviceCalibration,
+    DevicePart,
+    PoseEstimator,
+    SearchConfig,
+    bin_poses,
+    device_calibration,
+    device_part,
+)
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import intrinsics
 from kmn_jax.objects import Part
@@ -20,7 +31,9 @@ from kmn_jax.pose import adi
 
 ASSETS = Path(experiments.__file__).parent / "assets"
 IMAGE = max((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))
-CONFIG = BinPosesConfig(num_seeds=32)
+OnDevice = tuple[DevicePart, DeviceCalibration]
+Seen = tuple[DepthImage, jax.Array, np.ndarray]
+CONFIG = BinPosesConfig(num_seeds=32, search=SearchConfig(CropSearchConfig(num_points=512)))
 FLOOR_MARGIN = 3.0  # mm
 
 
@@ -35,12 +48,13 @@ def motor(estimator: PoseEstimator) -> Part:
 
 
 @pytest.fixture(scope="module")
-def on_device(estimator: PoseEstimator, motor: Part) -> BinPart:
-    return bin_part(estimator.model, motor, estimator.probabilities.found, CONFIG)
+def on_device(estimator: PoseEstimator, motor: Part) -> OnDevice:
+    assert estimator.model.config.num_scene_points == 512
+    return device_part(estimator.model, motor), device_calibration(estimator.probabilities.found)
 
 
 @pytest.fixture(scope="module")
-def seen() -> tuple[Sight, jax.Array, np.ndarray]:
+def seen() -> Seen:
     """The image, which of its pixels are above the floor, and the true poses."""
     scan, instances = bop_scan(IMAGE)
     assert instances is not None
@@ -49,23 +63,28 @@ def seen() -> tuple[Sight, jax.Array, np.ndarray]:
     floor = np.median(scan.depth[scan.depth > 0])
     above = (scan.depth > 0) & (scan.depth < floor - FLOOR_MARGIN)
     truth = np.array([one.T_camera_object for one in instances], dtype=np.float32)
-    return Sight(jnp.asarray(scan.depth), intrinsics(scan.camera)), jnp.asarray(above), truth
+    return DepthImage(jnp.asarray(scan.depth), intrinsics(scan.camera)), jnp.asarray(above), truth
 
 
 def solve(
-    estimator: PoseEstimator, part: BinPart, sight: Sight, foreground: jax.Array, key: jax.Array | None = None
+    estimator: PoseEstimator,
+    part: OnDevice,
+    image: DepthImage,
+    foreground: jax.Array,
+    key: jax.Array | None = None,
 ) -> BinPoses:
-    model = estimator.model
     key = jax.random.key(0) if key is None else key
-    count = model.config.num_scene_points
-    return bin_poses(*model, part, sight, foreground, key, num_points=count, config=CONFIG)
+    return bin_poses(*estimator.model, *part, image, foreground, key, config=CONFIG)
 
 
 def test_copies_are_found_from_the_likeliest_on(
-    estimator: PoseEstimator, on_device: BinPart, motor: Part, seen: tuple[Sight, jax.Array, np.ndarray]
+    estimator: PoseEstimator,
+    on_device: OnDevice,
+    motor: Part,
+    seen: Seen,
 ) -> None:
-    sight, above, truth = seen
-    found = jax.device_get(solve(estimator, on_device, sight, above))
+    image, above, truth = seen
+    found = jax.device_get(solve(estimator, on_device, image, above))
     likely = found.mask & (found.probability >= 0.5)
     points = motor.points[:500]
     errors = np.array([[float(adi(pose, one, points)) for one in truth] for pose in found.T_camera_object[likely]])
@@ -77,34 +96,39 @@ def test_copies_are_found_from_the_likeliest_on(
     assert (np.diff(found.probability) <= 0).all()
     assert not found.mask[found.mask.sum() :].any(), "what there is comes first"
     np.testing.assert_array_equal(found.T_camera_object[~found.mask], np.eye(4)[None].repeat((~found.mask).sum(), 0))
-    assert found.overflow == (np.count_nonzero(np.asarray(sight.depth)) > CONFIG.max_points)
+    assert found.overflow == (np.count_nonzero(np.asarray(image.depth)) > CONFIG.max_points)
 
 
 def test_nothing_goes_through_the_host_and_bits_are_the_same(
-    estimator: PoseEstimator, on_device: BinPart, seen: tuple[Sight, jax.Array, np.ndarray]
+    estimator: PoseEstimator,
+    on_device: OnDevice,
+    seen: Seen,
 ) -> None:
-    sight, above, _ = seen
+    image, above, _ = seen
     key = jax.random.key(1)
-    first = solve(estimator, on_device, sight, above, key)
+    first = solve(estimator, on_device, image, above, key)
     with jax.transfer_guard("disallow"):
-        again = jax.block_until_ready(solve(estimator, on_device, sight, above, key))
+        again = jax.block_until_ready(solve(estimator, on_device, image, above, key))
     jax.tree.map(np.testing.assert_array_equal, first, again)
 
 
 @pytest.mark.parametrize("empty", ["depth", "foreground"])
 def test_an_image_of_nothing_has_no_poses(
-    estimator: PoseEstimator, on_device: BinPart, seen: tuple[Sight, jax.Array, np.ndarray], empty: str
+    estimator: PoseEstimator,
+    on_device: OnDevice,
+    seen: Seen,
+    empty: str,
 ) -> None:
-    sight, above, _ = seen
+    image, above, _ = seen
     if empty == "depth":
-        sight = sight._replace(depth=jnp.zeros_like(sight.depth))
+        image = image._replace(depth=jnp.zeros_like(image.depth))
     else:
         above = jnp.zeros_like(above)
-    found = solve(estimator, on_device, sight, above)
+    found = solve(estimator, on_device, image, above)
     assert not found.mask.any()
     assert not found.probability.any()
     np.testing.assert_array_equal(found.T_camera_object, np.eye(4)[None].repeat(CONFIG.num_seeds, 0))
-    assert found.overflow == (empty != "depth" and np.count_nonzero(np.asarray(sight.depth)) > CONFIG.max_points)
+    assert found.overflow == (empty != "depth" and np.count_nonzero(np.asarray(image.depth)) > CONFIG.max_points)
 
 
 @pytest.mark.parametrize("values", [{"num_seeds": 0}, {"num_seeds": 64, "max_points": 32}])

@@ -12,25 +12,28 @@ import pytest
 from flax import nnx
 
 import experiments
-import kmn_jax.detection._crop_pose as crop_pose_module
 from experiments.evaluation.cases import Case, ObjectImages, draw_cases, padded
+from experiments.evaluation.methods import Ours
 from experiments.evaluation.sources import bop_objects
 from kmn_jax.detection import (
-    CropPoseConfig,
-    SceneArrays,
-    crop_for_draws,
-    crop_pose,
+    CropSearchConfig,
+    ForegroundOptions,
+    PoseEstimator,
     draw_of_crop,
     matches_of,
-    said_of_draw,
+    poses_at,
+    predict,
     search_draws,
 )
+from kmn_jax.detection._crop_search import crop_of_scene, find_poses_in_crop
+from kmn_jax.errors import InputError
+from kmn_jax.geometry import PaddedCloud
 from kmn_jax.models import Model, load_model, released_file
 from kmn_jax.objects import PartArrays, arrays_of, make_part
 from kmn_jax.pose import PoseResult, PoseStatus, adi, ransac
 
 SMALL = Path(experiments.__file__).parent / "assets" / "small_test_set"
-CONFIG = CropPoseConfig(num_draws=2, num_modes=2)
+CONFIG = CropSearchConfig(num_points=512, num_draws=2, num_modes=2, icp=None)
 
 
 @pytest.fixture(scope="module")
@@ -54,9 +57,11 @@ def part(model: Model, gear: ObjectImages) -> PartArrays:
     return arrays_of(model, make_part(gear.model, model))
 
 
-def solve(model: Model, part: PartArrays, scene: SceneArrays, config: CropPoseConfig = CONFIG) -> PoseResult:
-    found = crop_pose(model.graphdef, model.parameters, part, scene, jax.random.key(0), 512, config)
-    return jax.device_get(found)
+def solve(model: Model, part: PartArrays, cloud: PaddedCloud, config: CropSearchConfig = CONFIG) -> PoseResult:
+    """Return the best pose."""
+    found = jax.device_get(poses_at(model, part, cloud, 0, 0, config))
+    best: PoseResult = jax.tree.map(lambda leaf: leaf[0], found.poses)
+    return best
 
 
 def test_parts_are_found_where_they_lie(model: Model, part: PartArrays, cases: list[Case], gear: ObjectImages) -> None:
@@ -79,9 +84,9 @@ def test_a_larger_capacity_gives_the_same_pose_and_compiles_the_crop_alone(
     scene = padded(cases[0].points)
     larger = jax.tree.map(lambda leaf: jnp.concatenate([leaf, jnp.zeros_like(leaf)]), scene)
     one = solve(model, part, scene)
-    before = crop_pose_module._pose_in_crop._cache_size(), crop_pose_module._crop._cache_size()
+    before = find_poses_in_crop._cache_size(), crop_of_scene._cache_size()
     other = solve(model, part, larger)
-    after = crop_pose_module._pose_in_crop._cache_size(), crop_pose_module._crop._cache_size()
+    after = find_poses_in_crop._cache_size(), crop_of_scene._cache_size()
     np.testing.assert_array_equal(one.T_scene_object, other.T_scene_object)
     assert after == (before[0], before[1] + 1)
 
@@ -96,28 +101,73 @@ def test_metres_and_millimetres_give_one_pose(model: Model, part: PartArrays, ca
     assert float(adi(scaled, one.T_scene_object, part.points)) < 0.05 * float(part.diameter)
 
 
+def test_the_evaluation_and_detection_at_a_point_have_one_pose(
+    model: Model, cases: list[Case], gear: ObjectImages
+) -> None:
+    estimator = PoseEstimator.from_pretrained()
+    part, everything = make_part(gear.model, model), ForegroundOptions(remove_plane="never")
+    solver, compared = Ours("ours", model).prepare(gear.model), 0
+    for case in cases[:3]:
+        evaluated = solver(case)
+        found = estimator.detect(
+            part,
+            case.points,
+            at=case.points[0],
+            unit="mm",
+            background=everything,
+            random_seed=case.random_seed,
+        )
+        if found.poses:
+            assert evaluated is not None
+            # Detections are proper rigid poses in float64, which float32 is but to rounding.
+            np.testing.assert_allclose(found.poses[0].T_scene_object, evaluated, atol=1e-4)
+            compared += 1
+    assert compared >= 2
+
+
 def test_one_draw_and_one_pose_are_the_published_search(model: Model, part: PartArrays, cases: list[Case]) -> None:
-    plain, scene, key = replace(CONFIG, num_draws=1, num_modes=1), padded(cases[0].points), jax.random.key(0)
-    found = solve(model, part, scene, plain)
-    _, pose_key = jax.random.split(key)
-    network = nnx.merge(model.graphdef, model.parameters)
-    crop = jax.jit(crop_for_draws, static_argnums=(3, 4))(part, scene, key, 512, plain)
-    said = jax.jit(lambda crop: said_of_draw(network, part, draw_of_crop(crop, 0, part.diameter, 512, plain)))(crop)
-    matches = matches_of(said, part, plain.matches)
-    alone = ransac(jax.random.split(pose_key, 1)[0], matches, plain.ransac)
+    plain = replace(CONFIG, num_draws=1, num_modes=1, num_poses=1)
+    network, key = nnx.merge(model.graphdef, model.parameters), jax.random.key(0)
+    crop = crop_of_scene(padded(cases[0].points), 0, part.diameter, key, plain)
+    found = jax.device_get(find_poses_in_crop(*model, part, crop, key, plain)).poses
+    prediction = jax.jit(lambda crop: predict(network, part, draw_of_crop(crop, 0, part.diameter, plain)))(crop)
+    matches = matches_of(prediction, part, plain.matches)
+    alone = ransac(jax.random.split(key, 1)[0], matches, plain.ransac)
     assert alone.converged
-    np.testing.assert_allclose(found.T_scene_object[:3, :3], alone.T_scene_object[:3, :3], atol=1e-3)
-    shift = np.asarray(found.T_scene_object)[:3, 3] - np.asarray(crop.seed) - np.asarray(alone.T_scene_object)[:3, 3]
+    pose = found.T_scene_object[0]
+    np.testing.assert_allclose(pose[:3, :3], alone.T_scene_object[:3, :3], atol=1e-3)
+    shift = pose[:3, 3] - np.asarray(crop.seed) - np.asarray(alone.T_scene_object)[:3, 3]
     assert np.linalg.norm(shift) < 1e-3 * float(part.diameter)
 
 
+def test_poses_differ_the_best_first_and_are_refined(model: Model, part: PartArrays, cases: list[Case]) -> None:
+    rough, fine = (
+        jax.device_get(poses_at(model, part, padded(cases[0].points), 0, 0, replace(CONFIG, icp=icp)))
+        for icp in (None, CropSearchConfig().icp)
+    )
+    there = rough.poses.converged
+    assert there[0]
+    assert (np.diff(rough.scores[there]) <= 0).all()
+    surface = np.asarray(part.points)
+    placed = [surface @ pose[:3, :3].T + pose[:3, 3] for pose in rough.poses.T_scene_object[there]]
+    for row, one in enumerate(placed):
+        for other in placed[:row]:
+            assert np.linalg.norm(one - other, axis=1).max() > 0.9 * CONFIG.distinct * float(part.diameter)
+    np.testing.assert_array_equal(fine.scores, rough.scores)
+    moved = np.abs(fine.poses.T_scene_object - rough.poses.T_scene_object)[there].max(axis=(1, 2))
+    assert (moved > 0).all()
+    truth = min(float(adi(fine.poses.T_scene_object[0], pose, surface)) for pose in cases[0].T_camera_object)
+    before = min(float(adi(rough.poses.T_scene_object[0], pose, surface)) for pose in cases[0].T_camera_object)
+    assert truth < before + 0.01 * float(part.diameter)
+
+
 def test_no_more_draws_are_made_than_it_takes(model: Model, part: PartArrays, cases: list[Case]) -> None:
-    config, scene, key = replace(CONFIG, num_draws=3), padded(cases[0].points), jax.random.key(0)
+    config, key = replace(CONFIG, num_draws=3), jax.random.key(0)
     network = nnx.merge(model.graphdef, model.parameters)
-    crop = jax.jit(crop_for_draws, static_argnums=(3, 4))(part, scene, key, 512, config)
-    search = jax.jit(search_draws, static_argnums=(0, 4, 5))
+    crop = crop_of_scene(padded(cases[0].points), 0, part.diameter, key, config)
+    search = jax.jit(search_draws, static_argnums=(0, 4))
     all_draws, one, none = (
-        search(network, part, crop, key, 512, replace(config, enough=enough)) for enough in (None, -9.0, 9.0)
+        search(network, part, crop, key, replace(config, enough=enough)) for enough in (None, -9.0, 9.0)
     )
     assert [int(found.num_draws) for found in (all_draws, one, none)] == [3, 1, 3]
     assert [int(jnp.isfinite(found.scores).any(axis=1).sum()) for found in (all_draws, one, none)] == [3, 1, 3]
@@ -125,8 +175,8 @@ def test_no_more_draws_are_made_than_it_takes(model: Model, part: PartArrays, ca
     poses = [found.poses.T_scene_object for found in (all_draws, none, one)]
     np.testing.assert_allclose(poses[1], poses[0], atol=1e-3)
     np.testing.assert_allclose(poses[2][0], poses[0][0], atol=1e-3)
-    np.testing.assert_array_equal(one.said.points[0], all_draws.said.points[0])
-    for leaf in jax.tree.leaves((one.said, one.poses)):
+    np.testing.assert_array_equal(one.predictions.points[0], all_draws.predictions.points[0])
+    for leaf in jax.tree.leaves((one.predictions, one.poses)):
         np.testing.assert_array_equal(leaf[1:], np.zeros_like(leaf[1:]))
 
 
@@ -139,11 +189,11 @@ def test_draws_are_full_and_share_but_the_seed_if_they_can(part: PartArrays, num
     points = np.zeros((4096, 3), dtype=np.float32)
     points[:count] = np.stack([grid, np.zeros(count), np.full(count, 500)], axis=1)
     points[[0, count // 2]] = points[[count // 2, 0]]
-    scene = SceneArrays(jnp.asarray(points), jnp.arange(len(points)) < count)
-    config = replace(CONFIG, num_draws=num_draws)
-    crop = jax.jit(crop_for_draws, static_argnums=(3, 4))(part, scene, jax.random.key(0), room + 1, config)
-    draw = jax.jit(draw_of_crop, static_argnums=(3, 4))
-    draws = [draw(crop, number, part.diameter, room + 1, config) for number in range(num_draws)]
+    scene = PaddedCloud(jnp.asarray(points), jnp.arange(len(points)) < count)
+    config = replace(CONFIG, num_draws=num_draws, num_points=room + 1)
+    crop = crop_of_scene(scene, 0, part.diameter, jax.random.key(0), config)
+    draw = jax.jit(draw_of_crop, static_argnums=3)
+    draws = [draw(crop, number, part.diameter, config) for number in range(num_draws)]
     taken = [np.asarray(one.points[one.mask][:, 0]) for one in draws]
     for one, values in zip(draws, taken, strict=True):
         assert values[0] == 0
@@ -161,14 +211,24 @@ def test_draws_are_full_and_share_but_the_seed_if_they_can(part: PartArrays, num
 def test_crops_of_next_to_nothing_have_no_pose(model: Model, part: PartArrays, count: int) -> None:
     points = np.zeros((16_384, 3), dtype=np.float32)
     points[:count] = np.random.default_rng(0).uniform(-5, 5, (count, 3)) + np.array([0, 0, 500])
-    found = solve(model, part, SceneArrays(jnp.asarray(points), jnp.arange(len(points)) < count))
+    found = solve(model, part, PaddedCloud(jnp.asarray(points), jnp.arange(len(points)) < count))
     assert not found.converged
     np.testing.assert_array_equal(found.T_scene_object, np.eye(4))
     assert found.num_inliers == 0
     assert found.status != PoseStatus.OK
 
 
-@pytest.mark.parametrize("values", [{"num_draws": 0}, {"num_modes": 0}, {"surface_points": 0}, {"enough": np.nan}])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"num_draws": 0},
+        {"num_modes": 0},
+        {"surface_points": 0},
+        {"enough": np.nan},
+        {"num_poses": 99},
+        {"icp_points": 0},
+    ],
+)
 def test_settings_without_meaning_are_refused(values: dict[str, int]) -> None:
-    with pytest.raises(ValueError, match=next(iter(values))):
-        CropPoseConfig(**values)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=next(iter(values))):
+        CropSearchConfig(**values)  # type: ignore[arg-type]

@@ -9,10 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.detection import SelectConfig, select, symmetry_transforms
-from kmn_jax.detection._select import accept, distances, overlaps, same_place
-from kmn_jax.objects import Symmetries
+from kmn_jax.detection import DevicePart, Selection, same_place, select, symmetry_transforms
+from kmn_jax.detection._selection import _greedy, overlap
+from kmn_jax.objects import Part, PartArrays, Symmetries
 from kmn_jax.objects._symmetry import rotation_about
+from kmn_jax.pose import mssd
+from kmn_jax.simulate import Surfels
 from tests.reference.meshes import pose, random_rotations
 from tests.reference.parts import box_part
 
@@ -25,12 +27,27 @@ def moved(x: float, y: float, z: float, rotation: np.ndarray | None = None) -> n
     return pose((x, y, z), np.eye(3) if rotation is None else rotation)
 
 
-def pairs(one: np.ndarray, others: list[np.ndarray]) -> jax.Array:
-    return jnp.asarray(np.stack([np.stack([one, other]) for other in others]).astype(np.float32))
-
-
 def apart(one: np.ndarray, others: list[np.ndarray], transforms: np.ndarray = NO_TURN) -> np.ndarray:
-    return np.asarray(distances(pairs(one, others), jnp.asarray(BOX.points), jnp.asarray(transforms)))
+    single = [mssd(one.astype("f4"), other.astype("f4"), BOX.points, transforms) for other in others]
+    return np.array(single)
+
+
+def on_device(part: Part) -> DevicePart:
+    points, normals = jnp.asarray(part.points), jnp.asarray(part.normals)
+    arrays = PartArrays(points, normals, jnp.zeros((8, 4)), jnp.float32(part.diameter))
+    surfels = Surfels(points, normals, jnp.float32(part.area))
+    return DevicePart(arrays, surfels, jnp.asarray(symmetry_transforms(part.symmetries)), jnp.float32(same_place(part)))
+
+
+def chosen(
+    poses: np.ndarray, score: np.ndarray, usable: np.ndarray | None = None, part: Part = BOX, **settings: float
+) -> Selection:
+    usable = np.ones(len(score), dtype=bool) if usable is None else usable
+    arrays = jnp.asarray(poses), jnp.asarray(score, jnp.float32), jnp.asarray(usable)
+    return jax.device_get(choose(*arrays, on_device(part), **settings))
+
+
+choose = jax.jit(select, static_argnames="contest")
 
 
 def test_distances_are_those_of_the_farthest_point() -> None:
@@ -63,9 +80,9 @@ def test_what_two_parts_share_is_counted_but_not_where_they_touch() -> None:
     half_turn = moved(0, 0, 0, rotation_about(Z, np.pi))
     others = [np.eye(4), moved(5, 0, 0), moved(0, 1.0, 0), moved(0, 0.4, 0), half_turn]
     spacing = jnp.float32((BOX.area / len(BOX.points)) ** 0.5)
-    found = overlaps(
-        pairs(np.eye(4), others), jnp.asarray(BOX.points), jnp.asarray(BOX.normals), spacing, jnp.float32(0.05)
-    )
+    surface = jnp.asarray(BOX.points), jnp.asarray(BOX.normals)
+    share = jax.jit(lambda other: overlap(jnp.eye(4), other, *surface, spacing, jnp.float32(0.05)))
+    found = np.array([share(jnp.asarray(other, jnp.float32)) for other in others])
     assert found[0] == 1
     assert found[1] == 0
     assert found[2] < 0.1  # they touch
@@ -79,13 +96,18 @@ def test_the_best_of_what_excludes_each_other_is_taken() -> None:
     excluded = np.zeros((5, 5), dtype=bool)
     for one, other in ((0, 1), (2, 4), (3, 1)):
         excluded[one, other] = excluded[other, one] = True
-    np.testing.assert_array_equal(accept(score, usable, excluded), [False, True, True, False, False])
-    np.testing.assert_array_equal(accept(score * 0, usable, excluded), [True, False, True, False, False])
+    rows = jnp.asarray(excluded)
+
+    def taken(score: np.ndarray) -> np.ndarray:
+        return np.asarray(_greedy(jnp.asarray(score), jnp.asarray(usable), lambda row: rows[row])[0])
+
+    np.testing.assert_array_equal(taken(score), [False, True, True, False, False])
+    np.testing.assert_array_equal(taken(score * 0), [True, False, True, False, False])
 
 
 def test_slender_parts_side_by_side_are_two() -> None:
     x, y, z = BOX.maximum - BOX.minimum
-    assert same_place(BOX, SelectConfig()) == pytest.approx(min(0.2 * BOX.diameter, sorted((x, y, z))[1] / 2))
+    assert same_place(BOX) == pytest.approx(min(0.2 * BOX.diameter, sorted((x, y, z))[1] / 2))
     along, angle = np.linspace(-0.5, 0.5, 256), np.arange(256) * 2.4
     round_ = np.stack([np.zeros(256), np.cos(angle), np.sin(angle)], axis=1)
     low = np.array([-0.5, -0.075, -0.075])
@@ -99,7 +121,7 @@ def test_slender_parts_side_by_side_are_two() -> None:
         area=0.47,
     )
     poses = np.stack([moved(0, 0.16 * row, 0) for row in range(3)]).astype(np.float32)
-    assert select(poses, np.array([0.9, 0.8, 0.7]), np.ones(3, dtype=bool), rod, SelectConfig()).kept.all()
+    assert chosen(poses, np.array([0.9, 0.8, 0.7]), part=rod).kept.all()
 
 
 @pytest.mark.parametrize("first", [0, 1])
@@ -110,12 +132,12 @@ def test_one_pose_an_instance_is_kept_and_rivals_for_its_place_make_the_gap(firs
     poses = np.stack([there, near, crossed, moved(0, 2.5, 3)]).astype(np.float32)
     score = np.array([0.9, 0.8, 0.7, 0.6])
     score[first] = 0.95
-    found = select(poses, score, np.ones(4, dtype=bool), BOX, SelectConfig())
+    found = chosen(poses, score)
     np.testing.assert_array_equal(found.kept, [first == 0, first == 1, False, True])
-    np.testing.assert_allclose(found.gap[first], 0.95 - 0.7)  # not the other form of itself
-    np.testing.assert_allclose(found.gap[3], 0.6)
+    np.testing.assert_allclose(found.gap[first], 0.95 - 0.7, rtol=1e-5)  # not the other form of itself
+    np.testing.assert_allclose(found.gap[3], 0.6, rtol=1e-5)
     assert not found.contenders.any()
-    close = select(poses, score, np.ones(4, dtype=bool), BOX, SelectConfig(contest=0.3))
+    close = chosen(poses, score, contest=0.3)
     np.testing.assert_array_equal(close.contenders, [False, False, True, False])
-    without = select(poses, score, np.array([False, False, False, True]), BOX, SelectConfig())
+    without = chosen(poses, score, np.array([False, False, False, True]))
     np.testing.assert_array_equal(without.kept, [False, False, False, True])

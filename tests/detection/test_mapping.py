@@ -1,0 +1,52 @@
+"""Maps over rows: inside of jit, with rows that are skipped, and on the host by two threads."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kmn_jax.detection import call_rows, map_real, map_rows
+
+
+class Pair(NamedTuple):
+    """Some results of an item."""
+
+    total: jax.Array
+    draw: jax.Array
+
+
+@jax.jit
+def one(values: jax.Array, key: jax.Array) -> Pair:
+    return Pair(jnp.cumsum(values), jax.random.normal(key, (3,)))
+
+
+def test_rows_are_mapped_in_their_order_and_skipped_where_not_real() -> None:
+    values, keys = jnp.arange(24.0).reshape(8, 3), jax.random.split(jax.random.key(0), 8)
+    whole = jax.vmap(one)(values, keys)
+    mapped = jax.jit(map_rows, static_argnums=0)(one, values, keys)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), mapped, whole)
+    real = jnp.arange(8) % 2 == 0
+    some = jax.jit(map_real, static_argnums=0)(one, real, values, keys)
+    np.testing.assert_allclose(some.total, jnp.where(real[:, None], whole.total, 0))
+    np.testing.assert_allclose(some.draw, jnp.where(real[:, None], whole.draw, 0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_calls_give_what_one_call_of_all_gives(count: int) -> None:
+    values, keys = np.arange(3.0 * count).reshape(count, 3), jax.random.split(jax.random.key(0), count)
+    found, whole = call_rows(one, jax.vmap(one), values, keys), jax.vmap(one)(values, keys)
+    for a, b in zip(found, whole, strict=True):
+        assert isinstance(a, np.ndarray)
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
+def test_errors_come_out_of_the_threads() -> None:
+    def fail(values: np.ndarray) -> jax.Array:
+        return jnp.dot(values, "text")
+
+    with pytest.raises(TypeError):
+        call_rows(fail, fail, np.zeros((4, 3)))
