@@ -69,14 +69,11 @@ class CropSearchConfig:
     icp_points: int = 256  # of a draw, on the object
 
     def __post_init__(self) -> None:
-        counts = ("num_draws", "num_modes", "num_poses", "surface_points", "icp_points")
-        for name in counts:
+        for name in ("num_draws", "num_modes", "num_poses", "surface_points", "icp_points"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)} must be 1 or more")
         if self.enough is not None and not abs(self.enough) < float("inf"):
             raise InputError(f"enough = {self.enough} must be finite; None makes all draws")
-        if self.num_poses > self.num_draws * self.num_modes:
-            raise InputError(f"num_poses = {self.num_poses} are more than all draws have: num_draws x num_modes")
 
     def of_network(self, config: KeyMatchNetConfig) -> CropSearchConfig:
         """Return the same with the number of points of a draw that a network was made for, unless it is given."""
