@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import logging
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -121,24 +119,22 @@ def _parse_glb(content: bytes) -> _Parsed:
     _check_counts(content)
     import trimesh
 
+    log = logging.getLogger("trimesh")
+    before, log.disabled = log.disabled, True  # what matters is reported as an error
     try:
-        with _quiet("trimesh"):
-            # Merged, primitives of which only some have a material make the reader fail.
-            scene = trimesh.load_scene(io.BytesIO(content), file_type="glb", process=False, merge_primitives=False)
-            parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-            vertices = [np.asarray(part.vertices, dtype=np.float64) for part in parts]
-            starts = np.cumsum([0] + [len(part) for part in vertices])
-            triangles = [
-                np.asarray(part.faces, dtype=np.int64) + start for part, start in zip(parts, starts, strict=False)
-            ]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            scene = trimesh.load_scene(io.BytesIO(content), file_type="glb", process=False, skip_materials=True)
+            mesh = scene.to_mesh()
+            vertices, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     except Exception as error:  # the reader has no error of its own, but all that Python has
         reason = str(error).strip().partition("\n")[0][:120]
         raise InputError(f"it is damaged ({type(error).__name__}: {reason})") from None
-    if not parts:
-        return np.zeros((0, 3)), None, np.zeros((0, 3), np.int64)
-    if any(array.shape[1:] != (3,) for array in (*vertices, *triangles)):
+    finally:
+        log.disabled = before
+    if vertices.shape[1:] != (3,) or triangles.shape[1:] != (3,):
         raise InputError("it is damaged: its positions or triangles are not three numbers each")
-    return np.concatenate(vertices), None, np.concatenate(triangles)
+    return vertices, None, triangles
 
 
 def _check_counts(content: bytes) -> None:
@@ -167,17 +163,3 @@ def check_triangles(vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarra
             f"triangles name vertices from {triangles.min()} to {triangles.max()}, but there are 0 to"
             f" {len(vertices) - 1}: export the part again"
         )
-
-
-@contextlib.contextmanager
-def _quiet(logger: str) -> Iterator[None]:
-    """Keep a reader's log and warnings from the user: what matters is reported as an error."""
-    log = logging.getLogger(logger)
-    before = log.disabled
-    log.disabled = True
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        log.disabled = before
