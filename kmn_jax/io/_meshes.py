@@ -23,10 +23,9 @@ from kmn_jax.units import check_unit
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb", ".step", ".stp")
 CLOUD_SUFFIXES = (".ply", ".pcd", ".xyz", ".xyzn")
 _FARTHEST = 1e18  # the squares of longer lengths leave float32
-_OWN_UNIT = {".glb": "m", ".step": "m", ".stp": "m"}  # STEP files state theirs; cascadio converts it to metres
+_IN_METRES = (".glb", ".step", ".stp")  # STEP files state their unit; cascadio converts it
 
-
-_Parsed = tuple[Float64[np.ndarray, "v 3"], Float64[np.ndarray, "v 3"] | None, Int64[np.ndarray, "t 3"]]
+Parsed = tuple[Float64[np.ndarray, "v 3"], Float64[np.ndarray, "v 3"] | None, Int64[np.ndarray, "t 3"]]
 
 
 @dataclass(frozen=True)
@@ -51,13 +50,12 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     if suffix not in MESH_SUFFIXES + CLOUD_SUFFIXES:
         known = ", ".join(dict.fromkeys(MESH_SUFFIXES + CLOUD_SUFFIXES))
         raise InputError(f"{path}: the format {suffix or 'without a suffix'} is not known: use one of {known}")
-    own = _OWN_UNIT.get(suffix)
-    if own and unit not in (None, own):
+    if suffix in _IN_METRES and unit not in (None, "m"):
         raise InputError(f"{path}: {suffix} files are read in metres, so the unit cannot be {unit}: leave it out")
-    unit = check_unit((own or "mm") if unit is None else unit)
+    unit = check_unit(("m" if suffix in _IN_METRES else "mm") if unit is None else unit)
     content = read_file(path)
     try:
-        vertices, normals, triangles = _parse(content, suffix)
+        vertices, normals, triangles = parse_mesh(content, suffix)
         if len(triangles) == 0 and suffix not in CLOUD_SUFFIXES:
             raise InputError(f"it holds no triangles: it is empty, truncated or not a {suffix} file")
         check_triangles(vertices, triangles)
@@ -68,15 +66,6 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     if len(triangles) or (normals is not None and not np.isfinite(normals).all()):
         normals = None
     return Mesh(vertices, triangles.astype(np.int32), normals, unit)
-
-
-def parse_points(content: bytes, suffix: str) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the points of a PLY, PCD or XYZ file's content, as they are, and their normals if it has any.
-
-    Raises InputError, without the file's name, if it is not of that format or truncated.
-    """
-    points, normals, _ = _parse(content, suffix)
-    return points, normals
 
 
 def read_file(path: Path, what: str = "a CAD file") -> bytes:
@@ -94,26 +83,31 @@ def read_file(path: Path, what: str = "a CAD file") -> bytes:
     return content
 
 
-def _parse(content: bytes, suffix: str) -> _Parsed:
+def parse_mesh(content: bytes, suffix: str) -> Parsed:
+    """Return vertices, the normals of a cloud if it has any, and triangles of a file's content, as they are.
+
+    Raises InputError, without the file's name, if it is not of that format or truncated.
+    """
     none = np.zeros((0, 3), np.int64)
-    if suffix == ".stl":
-        vertices = parse_stl(content).reshape(-1, 3)
-        return vertices, None, np.arange(len(vertices)).reshape(-1, 3)
-    if suffix == ".obj":
-        vertices, triangles = parse_obj(content)
-        return vertices, None, triangles
-    if suffix == ".ply":
-        return parse_ply(content)
-    if suffix == ".pcd":
-        return *parse_pcd(content), none
-    if suffix in (".xyz", ".xyzn"):
-        return *parse_xyz(content, with_normals=suffix == ".xyzn"), none
-    if suffix == ".glb":
-        return _parse_glb(content)
+    match suffix:
+        case ".stl":
+            vertices = parse_stl(content).reshape(-1, 3)
+            return vertices, None, np.arange(len(vertices)).reshape(-1, 3)
+        case ".obj":
+            vertices, triangles = parse_obj(content)
+            return vertices, None, triangles
+        case ".ply":
+            return parse_ply(content)
+        case ".pcd":
+            return *parse_pcd(content), none
+        case ".xyz" | ".xyzn":
+            return *parse_xyz(content, with_normals=suffix == ".xyzn"), none
+        case ".glb":
+            return _parse_glb(content)
     return _parse_glb(step_to_glb(content))
 
 
-def _parse_glb(content: bytes) -> _Parsed:
+def _parse_glb(content: bytes) -> Parsed:
     if content[:4] != b"glTF" or int.from_bytes(content[8:12], "little") != len(content):
         raise InputError("it is truncated, or not a GLB file")
     _check_counts(content)

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import strategies as st
 
 from kmn_jax.errors import InputError
-from kmn_jax.io import _step as step_files
-from kmn_jax.io import read_mesh
+from kmn_jax.io import _apart, _step, read_mesh
 from kmn_jax.io._meshes import CLOUD_SUFFIXES
 from tests.io.mesh_sample import CLOUDS, MESHES, POLYGONS_PLY, STEP, whole_files, written
 
@@ -142,7 +141,7 @@ DAMAGED = {
     "nan.glb": (lambda v: v["mesh.glb"].replace(struct.pack("<f", 11), struct.pack("<f", np.nan)), "NaN"),
     "self.step": (lambda _: re.sub(rb"(#\d+) = VECTOR\('',#\d+", rb"\1 = VECTOR('',\1", STEP), "ended with code"),
     "syntax.step": (lambda _: STEP.replace(b"CLOSED_SHELL('',(", b"CLOSED_SHELL('',"), ""),
-    "hollow.step": (lambda _: STEP.partition(b"DATA;")[0] + b"DATA;\nENDSEC;\nEND-ISO-10303-21;\n", "no shape"),
+    "hollow.step": (lambda _: STEP.partition(b"DATA;")[0] + b"DATA;\nENDSEC;\nEND-ISO-10303-21;\n", "nothing to read"),
     "cut.step": (lambda _: STEP[: len(STEP) // 2] + b"\nENDSEC;\nEND-ISO-10303-21;\n", "damaged"),
     "nan.xyz": (lambda _: "0 0 0\n1 nan 1\n2 2 2\n", "1 of 3 vertices are NaN, .* number 1"),
     "words.xyz": (lambda _: "x y z\n0 0 0\n", "could not convert string 'x'"),
@@ -167,13 +166,13 @@ def test_damaged_files(name, valid, tmp_path):
 
 
 def test_a_converter_that_hangs_is_ended(tmp_path, monkeypatch):
-    monkeypatch.setattr(step_files, "_PROGRAM", "import time; print('noise'); time.sleep(600)")
-    monkeypatch.setattr(step_files, "_SECONDS", 0.5)
-    refused(written(tmp_path, "a.step", STEP), r"longer than 0.5 s: export it as STL")
+    monkeypatch.setattr(_step, "_PROGRAM", "import time; print('noise'); time.sleep(600)")
+    monkeypatch.setattr(_apart, "_SECONDS", 0.5)
+    refused(written(tmp_path, "a.step", STEP), r"longer than 0.5 s: save it in another format")
 
 
 def test_missing_readers_are_named(tmp_path, monkeypatch):
-    monkeypatch.setattr(step_files.importlib.util, "find_spec", lambda _: None)
+    monkeypatch.setattr(_apart.importlib.util, "find_spec", lambda _: None)
     refused(written(tmp_path, "a.step", STEP), r"pip install 'kmn_jax\[data\]'")
 
 
