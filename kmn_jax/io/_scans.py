@@ -120,7 +120,8 @@ def read_camera(path: str | Path) -> DepthCamera:
             if len(matrix) != 9:
                 raise ValueError(f"cam_K has {len(matrix)} numbers instead of 9")
             return _intrinsics(matrix.reshape(3, 3), "cam_K", scale, size)
-        return DepthCamera(*(float(found[name]) for name in ("fx", "fy", "cx", "cy")), scale, size)
+        fx, fy, cx, cy = (float(found[name]) for name in ("fx", "fy", "cx", "cy"))
+        return DepthCamera(fx, fy, cx, cy, scale, size)
     except KeyError as error:
         raise InputError(f"{path} cannot be used: it has no {error}, give fx, fy, cx and cy, or cam_K") from None
     except (TypeError, ValueError, OverflowError, RecursionError) as error:

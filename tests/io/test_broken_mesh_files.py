@@ -2,14 +2,11 @@ import re
 import struct
 from pathlib import Path
 
-import hypothesis
 import numpy as np
 import pytest
-from hypothesis import strategies as st
 
 from kmn_jax.errors import InputError
 from kmn_jax.io import _apart, _step, read_mesh
-from kmn_jax.io._meshes import CLOUD_SUFFIXES
 from tests.io.mesh_sample import CLOUDS, MESHES, POLYGONS_PLY, STEP, whole_files, written
 
 
@@ -180,63 +177,3 @@ def test_working_folder_cannot_replace_the_converter(tmp_path, monkeypatch):
     (tmp_path / "cascadio.py").write_text("raise SystemExit(3)")
     monkeypatch.chdir(tmp_path)
     assert len(read_mesh(written(tmp_path, "a.step", STEP)).triangles) == 12
-
-
-@st.composite
-def mutation(draw):
-    """Return a function that damages bytes: cut off, overwritten, left out, doubled, digits changed."""
-    kind = draw(st.sampled_from(["cut", "bytes", "leave", "double", "insert", "digits"]))
-    places = draw(st.lists(st.floats(0, 1, exclude_max=True), min_size=1, max_size=4))
-    piece = draw(st.binary(min_size=1, max_size=8))
-    length = draw(st.integers(1, 60))
-
-    def apply(content):
-        result = bytearray(content)
-        if kind == "cut":
-            del result[int(places[0] * len(result)) :]
-        elif kind == "digits":
-            digits = [index for index, byte in enumerate(result) if byte in b"0123456789"]
-            for place, byte in zip(places, piece, strict=False):
-                if digits:
-                    result[digits[int(place * len(digits))]] = b"0123456789-. e"[byte % 14]
-        else:
-            for place in places if kind == "bytes" else places[:1]:
-                start = int(place * len(result))
-                old = result[start : start + length]
-                new = {"bytes": piece[:1], "leave": b"", "double": old + old, "insert": piece + old}[kind]
-                result[start : start + (1 if kind == "bytes" else length)] = new
-        return bytes(result)
-
-    return apply
-
-
-def check_read_or_refused(path):
-    try:
-        mesh = read_mesh(path)
-    except InputError:
-        return
-    assert len(mesh.vertices) > 0
-    assert np.isfinite(mesh.vertices).all()
-    if len(mesh.triangles):
-        assert 0 <= mesh.triangles.min() <= mesh.triangles.max() < len(mesh.vertices)
-    else:
-        assert path.suffix in CLOUD_SUFFIXES
-
-
-@pytest.mark.parametrize("name", [name for name in MESHES + CLOUDS if not name.endswith("step")])
-def test_mutated_files_are_read_or_refused(name, valid, tmp_path):
-    @hypothesis.settings(max_examples=60, deadline=5000, derandomize=True, database=None)
-    @hypothesis.given(mutation())
-    def check(mutate):
-        check_read_or_refused(written(tmp_path, name, mutate(valid[name]) or b"x"))
-
-    check()
-
-
-def test_mutated_step_files_are_read_or_refused(tmp_path):
-    @hypothesis.settings(max_examples=8, deadline=None, derandomize=True, database=None)
-    @hypothesis.given(mutation())
-    def check(mutate):
-        check_read_or_refused(written(tmp_path, "a.step", mutate(STEP) or b"x"))
-
-    check()
