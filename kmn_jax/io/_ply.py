@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -41,7 +42,7 @@ def parse_ply(
     encoding, elements, body = _header(content)
     if encoding == "ascii":
         body, elements = _as_doubles(body, elements)
-    vertices, normals, triangles = None, None, [np.zeros((0, 3), np.int64)]
+    vertices, normals, triangles = None, None, np.zeros((0, 3), np.int64)
     position = 0
     for element in elements:
         tables = []
@@ -53,14 +54,14 @@ def parse_ply(
         elif element.name == "face":
             lists = [entry.name for entry in element.properties if entry.count_kind]
             name = next((name for name in lists if name in ("vertex_indices", "vertex_index")), None)
-            triangles += [_fans(table[name]) for table in tables if name]
-            if element.size and not any(map(len, triangles)):
+            triangles = _fans([table[name] for table in tables if name])
+            if element.size and not len(triangles):
                 raise InputError("its faces have no lists of three or more vertex_indices")
     if position != len(body):
         raise InputError("it is damaged: it holds more data than its header announces")
     if vertices is None:
         raise InputError("it has no vertices with x, y and z")
-    return vertices, normals, np.concatenate(triangles)
+    return vertices, normals, triangles
 
 
 def _header(content: bytes) -> tuple[str, list[_Element], bytes]:
@@ -114,10 +115,17 @@ def _tables(body: bytes, position: int, element: _Element, order: str) -> Iterat
     left, most = (element.size if element.properties else 0), element.size
     while left:
         row = _row(body, position, element, order)
-        table = np.frombuffer(body, row, min(left, most, (len(body) - position) // row.itemsize), position)
+        room = (len(body) - position) // row.itemsize
+        if room < 1:
+            raise InputError(
+                f"it is truncated: it has fewer than the {element.size} entries of {element.name} it announces"
+            )
+        table = np.frombuffer(body, row, min(left, most, room), position)
         same = np.ones(len(table), dtype=bool)
-        for counts in (table[name] for name in row.names or () if name.startswith("number of ")):
-            same &= counts == counts[0]
+        for name, _, count_kind in element.properties:
+            if count_kind:
+                counts = table[f"number of {name}"]
+                same &= counts == counts[0]
         table = table if same.all() else table[: same.argmin()]
         yield table
         position, left = position + table.nbytes, left - len(table)
@@ -127,25 +135,24 @@ def _tables(body: bytes, position: int, element: _Element, order: str) -> Iterat
 def _row(body: bytes, position: int, element: _Element, order: str) -> np.dtype:
     """Return the type of the row that starts at `position`, in which each list has its length."""
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
-    truncated = InputError(
-        f"it is truncated: it has fewer than the {element.size} entries of {element.name} it announces"
-    )
     for name, kind, count_kind in element.properties:
         length = 1
         if count_kind:
-            start, position = position, position + np.dtype(count_kind).itemsize
-            if position > len(body):
-                raise truncated
-            count = np.frombuffer(body, order + count_kind, 1, start)[0]
-            if not 0 <= count <= len(body) or count != int(count):
-                raise InputError(f"it is damaged: a list of {element.name} has {count} entries")
+            start, position = position, position + int(count_kind[1])
+            # A row that ends beyond the body is found by its size.
+            count = np.frombuffer(body, order + count_kind, 1, start)[0] if position <= len(body) else 0
+            if not 0 <= count <= max(len(body) - position, 0) / int(kind[1]) or count != int(count):
+                raise InputError(f"it is truncated or damaged: a list of {element.name} has {count} entries")
             length = int(count)
             fields.append((f"number of {name}", order + count_kind))
         fields.append((name, order + kind, (length,)) if count_kind else (name, order + kind))
-        position += length * np.dtype(kind).itemsize
-        if position > len(body):
-            raise truncated
-    return np.dtype(fields)
+        position += length * int(kind[1])
+    return _row_type(tuple(fields))
+
+
+@functools.lru_cache(maxsize=100)
+def _row_type(fields: tuple[tuple, ...]) -> np.dtype:
+    return np.dtype(list(fields))
 
 
 def _vectors(
@@ -156,11 +163,17 @@ def _vectors(
     return np.concatenate([np.stack([table[name] for name in names], axis=1) for table in tables]).astype(np.float64)
 
 
-def _fans(polygons: Shaped[np.ndarray, "n k"]) -> Int64[np.ndarray, "t 3"]:
-    """Cut polygons into triangles around their first corners."""
-    if polygons.dtype.kind == "f":
-        whole = np.isfinite(polygons) & (np.abs(polygons) < _MAX_INDEX) & (polygons == np.rint(polygons))
+def _fans(polygons: list[np.ndarray]) -> Int64[np.ndarray, "t 3"]:
+    """Cut polygons, given as tables of those of the same number of corners, into triangles around their first ones."""
+    if not polygons:
+        return np.zeros((0, 3), np.int64)
+    corners = np.concatenate([table.reshape(-1) for table in polygons])
+    if corners.dtype.kind == "f":
+        whole = np.isfinite(corners) & (np.abs(corners) < _MAX_INDEX) & (corners == np.rint(corners))
         if not whole.all():
             raise InputError("it is damaged: a face names a vertex by something that is not a whole number")
-    first = np.repeat(polygons[:, :1], max(polygons.shape[1] - 2, 0), axis=1)
-    return np.stack([first, polygons[:, 1:-1], polygons[:, 2:]], axis=2).reshape(-1, 3).astype(np.int64)
+    sizes = np.repeat([table.shape[1] for table in polygons], [len(table) for table in polygons])
+    number = np.maximum(sizes - 2, 0)
+    first = np.repeat(np.cumsum(sizes) - sizes, number)
+    within = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number, number)
+    return corners[np.stack([first, first + within + 1, first + within + 2], axis=1)].astype(np.int64)

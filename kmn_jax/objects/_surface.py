@@ -163,7 +163,7 @@ def _simplify(
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "s 3"]]:
     import open3d
 
-    diagonal = float(np.linalg.norm(np.ptp(vertices[np.unique(triangles)], axis=0)))
+    diagonal = float(np.linalg.norm(np.ptp(vertices[triangles.reshape(-1)], axis=0)))
     if not diagonal > 0:
         return vertices, triangles
     mesh = open3d.geometry.TriangleMesh(

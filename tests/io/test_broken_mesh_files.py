@@ -168,11 +168,6 @@ def test_a_converter_that_hangs_is_ended(tmp_path, monkeypatch):
     refused(written(tmp_path, "a.step", STEP), r"longer than 0.5 s: save it in another format")
 
 
-def test_missing_readers_are_named(tmp_path, monkeypatch):
-    monkeypatch.setattr(_apart.importlib.util, "find_spec", lambda _: None)
-    refused(written(tmp_path, "a.step", STEP), r"pip install 'kmn_jax\[data\]'")
-
-
 def test_working_folder_cannot_replace_the_converter(tmp_path, monkeypatch):
     (tmp_path / "cascadio.py").write_text("raise SystemExit(3)")
     monkeypatch.chdir(tmp_path)

@@ -301,13 +301,8 @@ def test_announced_sizes_take_no_memory(tmp_path: Path) -> None:
     refused(tmp_path / "depth.png", "it announces 49000000 pixels")
 
 
-def test_a_decoder_that_hangs_or_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_decoder_that_crashes_or_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = exr(tmp_path / "depth.exr", {"Z": DEPTH})
-    with monkeypatch.context() as patched:
-        patched.setattr(_exr, "_PROGRAM", "import time; time.sleep(600)")
-        patched.setattr(_apart, "_SECONDS", 0.3)
-        with pytest.raises(InputError, match=r"takes longer than 0.3 s"):
-            read_scan(path, "m", camera_file(tmp_path))
     monkeypatch.setattr(_exr, "_PROGRAM", "import os; os.abort()")
     with pytest.raises(InputError, match="the decoder ended with code"):
         read_scan(path, "m", camera_file(tmp_path))
