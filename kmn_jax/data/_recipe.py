@@ -85,7 +85,7 @@ def pack_object(
     """
     clock = _Clock()
     with clock("model"):
-        model = load_object(path, config=ObjectConfig(num_points=config.surfels, seed=config.seed)).in_unit("m")
+        model = load_object(path, config=ObjectConfig(num_points=config.surfels, random_seed=config.seed)).in_unit("m")
     with clock("hulls"):
         shape = collision_shape(model.vertices, model.triangles, config.hulls)
     mesh = RayMesh(model.vertices, model.triangles)

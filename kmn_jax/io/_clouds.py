@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from kmn_jax.errors import InputError
 
 Cloud = tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"] | None]  # points, normals
-_Field = tuple[str, np.dtype, int]  # name, type, numbers a point
+_KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
 def parse_xyz(content: bytes, with_normals: bool) -> Cloud:
@@ -32,34 +32,23 @@ def parse_xyz(content: bytes, with_normals: bool) -> Cloud:
     return table[:, :3], table[:, 3:6] if with_normals else None
 
 
+@np.errstate(invalid="ignore")  # the conversion of a signalling NaN, which is found later
 def parse_pcd(content: bytes) -> Cloud:
     """Return the points of a PCD file's content, and their normals if there are any.
 
     Raises InputError, without the file's name, if the content is not what its header announces, or no PCD.
     """
     header, body = _header(content)
-    fields, sizes, types = (header.get(key, []) for key in ("FIELDS", "SIZE", "TYPE"))
-    counts = header.get("COUNT", ["1"] * len(fields))
     try:
-        total = int(header["POINTS"][0]) if "POINTS" in header else int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
-        row = [
-            (name, np.dtype("<" + _TYPES[kind] + size), int(count))
-            for name, kind, size, count in zip(fields, types, sizes, counts, strict=True)
-        ]
-        if total < 0:
-            raise ValueError(f"{total} points")
-        columns = _READERS[header["DATA"][0]](body, row, total)
+        named = _columns(header, body)
     except (ValueError, TypeError, KeyError, IndexError, OverflowError) as error:
         raise InputError(f"it is truncated or damaged, or not a PCD file ({type(error).__name__}: {error})") from None
-    named = {name: column[:, 0] for (name, _, count), column in zip(row, columns, strict=True) if count == 1}
     if not {"x", "y", "z"} <= named.keys():
         raise InputError("its points have no x, y and z")
-    with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN, which is found later
-        points = np.stack([named[name] for name in ("x", "y", "z")], axis=1).astype(np.float64)
-        if not {"normal_x", "normal_y", "normal_z"} <= named.keys():
-            return points, None
-        normals = np.stack([named[f"normal_{name}"] for name in ("x", "y", "z")], axis=1)
-        return points, normals.astype(np.float64)
+    points = np.stack([named[name] for name in ("x", "y", "z")], axis=1).astype(np.float64)
+    if not {"normal_x", "normal_y", "normal_z"} <= named.keys():
+        return points, None
+    return points, np.stack([named[f"normal_{name}"] for name in ("x", "y", "z")], axis=1).astype(np.float64)
 
 
 def _header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
@@ -78,32 +67,32 @@ def _header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
     return header, content[position:]
 
 
-def _read_text(body: bytes, row: list[_Field], total: int) -> list[np.ndarray]:
-    words = body.split()
-    table = np.fromiter(map(float, words), np.float64, len(words)).reshape(total, sum(count for _, _, count in row))
-    return np.split(table, np.cumsum([count for _, _, count in row])[:-1], axis=1)
-
-
-def _read_binary(body: bytes, row: list[_Field], total: int) -> list[np.ndarray]:
-    record = np.dtype([(str(index), kind, (count,)) for index, (_, kind, count) in enumerate(row)])
-    if len(body) != total * record.itemsize:
-        raise ValueError(f"{total} points take {total * record.itemsize} bytes, but there are {len(body)}")
+def _columns(header: dict[str, list[str]], body: bytes) -> dict[str, np.ndarray]:
+    """Return the fields of one number a point by name."""
+    total = int(header["POINTS"][0]) if "POINTS" in header else int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
+    names, counts = header["FIELDS"], [int(count) for count in header.get("COUNT", ["1"] * len(header["FIELDS"]))]
+    kinds = ["<" + _KINDS[kind] + size for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
+    layout = header["DATA"][0]
+    if layout not in ("ascii", "binary", "binary_compressed"):
+        raise ValueError(f"DATA {layout}")
+    if layout == "ascii":
+        words = body.split()
+        body, kinds = np.fromiter(map(float, words), "<f8", len(words)).tobytes(), ["<f8"] * len(kinds)
+    fields = list(zip(names, kinds, counts, strict=True))
+    size = total * sum(np.dtype(kind).itemsize * count for _, kind, count in fields)
+    by_column = layout == "binary_compressed"
+    if by_column:
+        packed, unpacked = (int.from_bytes(body[start : start + 4], "little") for start in (0, 4))
+        if len(body) - 8 < packed or unpacked != size:
+            raise ValueError(f"{len(body)} bytes of data do not hold {total} points")
+        body = _unpack_lzf(body[8 : 8 + packed])
+    if total < 0 or len(body) != size:
+        raise ValueError(f"{total} points take {size} bytes, but there are {len(body)}")
+    # Stored point after point, or all values of the first field, then of the next.
+    shapes = [(total, count) if by_column else (count,) for count in counts]
+    record = np.dtype([(str(i), kind, shapes[i]) for i, (_, kind, _) in enumerate(fields)])
     table = np.frombuffer(body, record)
-    return [table[name] for name in record.names or ()]
-
-
-def _read_compressed(body: bytes, row: list[_Field], total: int) -> list[np.ndarray]:
-    packed, unpacked = (int.from_bytes(body[start : start + 4], "little") for start in (0, 4))
-    if len(body) - 8 < packed or unpacked != total * sum(kind.itemsize * count for _, kind, count in row):
-        raise ValueError(f"{len(body)} bytes of data do not hold {total} points")
-    data = _unpack_lzf(body[8 : 8 + packed])
-    if len(data) != unpacked:
-        raise ValueError(f"the data unpack to {len(data)} bytes instead of {unpacked}")
-    columns, position = [], 0
-    for _, kind, count in row:  # field after field, each for all points
-        columns.append(np.frombuffer(data, kind, total * count, position).reshape(total, count))
-        position += columns[-1].nbytes
-    return columns
+    return {name: table[str(i)].reshape(total) for i, (name, _, count) in enumerate(fields) if count == 1}
 
 
 def _unpack_lzf(packed: bytes) -> bytes:
@@ -119,14 +108,10 @@ def _unpack_lzf(packed: bytes) -> bytes:
         if length == 7:
             length += packed[position]
             position += 1
-        back = ((control & 31) << 8) + packed[position] + 1
+        start = len(result) - ((control & 31) << 8) - packed[position] - 1
         position += 1
-        if back > len(result):
+        if start < 0:
             raise ValueError("the data are not LZF")
-        piece = bytes(result[-back:][: length + 2])
+        piece = result[start : start + length + 2]
         result += (piece * (length + 2))[: length + 2]  # it may overlap what it yields
     return bytes(result)
-
-
-_TYPES = {"F": "f", "I": "i", "U": "u"}
-_READERS = {"ascii": _read_text, "binary": _read_binary, "binary_compressed": _read_compressed}

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import logging
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,10 +23,9 @@ from kmn_jax.units import check_unit
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb", ".step", ".stp")
 CLOUD_SUFFIXES = (".ply", ".pcd", ".xyz", ".xyzn")
 _FARTHEST = 1e18  # the squares of longer lengths leave float32
-_OWN_UNIT = {".glb": "m", ".step": "m", ".stp": "m"}  # STEP files state theirs; cascadio converts it to metres
+_IN_METRES = (".glb", ".step", ".stp")  # STEP files state their unit; cascadio converts it
 
-
-_Parsed = tuple[Float64[np.ndarray, "v 3"], Float64[np.ndarray, "v 3"] | None, Int64[np.ndarray, "t 3"]]
+Parsed = tuple[Float64[np.ndarray, "v 3"], Float64[np.ndarray, "v 3"] | None, Int64[np.ndarray, "t 3"]]
 
 
 @dataclass(frozen=True)
@@ -53,13 +50,12 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     if suffix not in MESH_SUFFIXES + CLOUD_SUFFIXES:
         known = ", ".join(dict.fromkeys(MESH_SUFFIXES + CLOUD_SUFFIXES))
         raise InputError(f"{path}: the format {suffix or 'without a suffix'} is not known: use one of {known}")
-    own = _OWN_UNIT.get(suffix)
-    if own and unit not in (None, own):
+    if suffix in _IN_METRES and unit not in (None, "m"):
         raise InputError(f"{path}: {suffix} files are read in metres, so the unit cannot be {unit}: leave it out")
-    unit = check_unit((own or "mm") if unit is None else unit)
+    unit = check_unit(("m" if suffix in _IN_METRES else "mm") if unit is None else unit)
     content = read_file(path)
     try:
-        vertices, normals, triangles = _parse(content, suffix)
+        vertices, normals, triangles = parse_mesh(content, suffix)
         if len(triangles) == 0 and suffix not in CLOUD_SUFFIXES:
             raise InputError(f"it holds no triangles: it is empty, truncated or not a {suffix} file")
         check_triangles(vertices, triangles)
@@ -70,15 +66,6 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     if len(triangles) or (normals is not None and not np.isfinite(normals).all()):
         normals = None
     return Mesh(vertices, triangles.astype(np.int32), normals, unit)
-
-
-def parse_points(content: bytes, suffix: str) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the points of a PLY, PCD or XYZ file's content, as they are, and their normals if it has any.
-
-    Raises InputError, without the file's name, if it is not of that format or truncated.
-    """
-    points, normals, _ = _parse(content, suffix)
-    return points, normals
 
 
 def read_file(path: Path, what: str = "a CAD file") -> bytes:
@@ -96,49 +83,52 @@ def read_file(path: Path, what: str = "a CAD file") -> bytes:
     return content
 
 
-def _parse(content: bytes, suffix: str) -> _Parsed:
+def parse_mesh(content: bytes, suffix: str) -> Parsed:
+    """Return vertices, the normals of a cloud if it has any, and triangles of a file's content, as they are.
+
+    Raises InputError, without the file's name, if it is not of that format or truncated.
+    """
     none = np.zeros((0, 3), np.int64)
-    if suffix == ".stl":
-        vertices = parse_stl(content).reshape(-1, 3)
-        return vertices, None, np.arange(len(vertices)).reshape(-1, 3)
-    if suffix == ".obj":
-        vertices, triangles = parse_obj(content)
-        return vertices, None, triangles
-    if suffix == ".ply":
-        return parse_ply(content)
-    if suffix == ".pcd":
-        return *parse_pcd(content), none
-    if suffix in (".xyz", ".xyzn"):
-        return *parse_xyz(content, with_normals=suffix == ".xyzn"), none
-    if suffix == ".glb":
-        return _parse_glb(content)
+    match suffix:
+        case ".stl":
+            vertices = parse_stl(content).reshape(-1, 3)
+            return vertices, None, np.arange(len(vertices)).reshape(-1, 3)
+        case ".obj":
+            vertices, triangles = parse_obj(content)
+            return vertices, None, triangles
+        case ".ply":
+            return parse_ply(content)
+        case ".pcd":
+            return *parse_pcd(content), none
+        case ".xyz" | ".xyzn":
+            return *parse_xyz(content, with_normals=suffix == ".xyzn"), none
+        case ".glb":
+            return _parse_glb(content)
     return _parse_glb(step_to_glb(content))
 
 
-def _parse_glb(content: bytes) -> _Parsed:
+def _parse_glb(content: bytes) -> Parsed:
     if content[:4] != b"glTF" or int.from_bytes(content[8:12], "little") != len(content):
         raise InputError("it is truncated, or not a GLB file")
     _check_counts(content)
     import trimesh
 
+    log = logging.getLogger("trimesh")
+    before, log.disabled = log.disabled, True  # what matters is reported as an error
     try:
-        with _quiet("trimesh"):
-            # Merged, primitives of which only some have a material make the reader fail.
-            scene = trimesh.load_scene(io.BytesIO(content), file_type="glb", process=False, merge_primitives=False)
-            parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-            vertices = [np.asarray(part.vertices, dtype=np.float64) for part in parts]
-            starts = np.cumsum([0] + [len(part) for part in vertices])
-            triangles = [
-                np.asarray(part.faces, dtype=np.int64) + start for part, start in zip(parts, starts, strict=False)
-            ]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            scene = trimesh.load_scene(io.BytesIO(content), file_type="glb", process=False, skip_materials=True)
+            mesh = scene.to_mesh()
+            vertices, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     except Exception as error:  # the reader has no error of its own, but all that Python has
         reason = str(error).strip().partition("\n")[0][:120]
         raise InputError(f"it is damaged ({type(error).__name__}: {reason})") from None
-    if not parts:
-        return np.zeros((0, 3)), None, np.zeros((0, 3), np.int64)
-    if any(array.shape[1:] != (3,) for array in (*vertices, *triangles)):
+    finally:
+        log.disabled = before
+    if vertices.shape[1:] != (3,) or triangles.shape[1:] != (3,):
         raise InputError("it is damaged: its positions or triangles are not three numbers each")
-    return np.concatenate(vertices), None, np.concatenate(triangles)
+    return vertices, None, triangles
 
 
 def _check_counts(content: bytes) -> None:
@@ -167,17 +157,3 @@ def check_triangles(vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarra
             f"triangles name vertices from {triangles.min()} to {triangles.max()}, but there are 0 to"
             f" {len(vertices) - 1}: export the part again"
         )
-
-
-@contextlib.contextmanager
-def _quiet(logger: str) -> Iterator[None]:
-    """Keep a reader's log and warnings from the user: what matters is reported as an error."""
-    log = logging.getLogger(logger)
-    before = log.disabled
-    log.disabled = True
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        log.disabled = before

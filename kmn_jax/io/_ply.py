@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import functools
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64, Int64, Shaped
 
 from kmn_jax.errors import InputError
 
@@ -18,30 +19,19 @@ _MAX_INDEX = 1e15  # of a vertex: what is beyond does not fit an integer
 _MAX_HEADER = 100_000  # bytes: what has no end by then is not a header
 
 
-@dataclass(frozen=True)
-class _Property:
+class _Property(NamedTuple):
     name: str
     kind: str  # of a value, as NumPy calls it
     count_kind: str = ""  # of the number of values, before a list
 
 
-@dataclass(frozen=True)
-class _Element:
+class _Element(NamedTuple):
     name: str
-    count: int
-    properties: tuple[_Property, ...]
+    size: int  # rows
+    properties: list[_Property]
 
 
-class _Lists(NamedTuple):
-    """Lists of numbers, one after the other."""
-
-    counts: np.ndarray
-    values: np.ndarray
-
-
-_Columns = dict[str, np.ndarray | _Lists]
-
-
+@np.errstate(invalid="ignore")  # the conversion of a signalling NaN, which is found later
 def parse_ply(
     content: bytes,
 ) -> tuple[Float64[np.ndarray, "v 3"], Float64[np.ndarray, "v 3"] | None, Int64[np.ndarray, "t 3"]]:
@@ -52,21 +42,26 @@ def parse_ply(
     encoding, elements, body = _header(content)
     if encoding == "ascii":
         body, elements = _as_doubles(body, elements)
-    found: dict[str, _Columns] = {}
+    vertices, normals, triangles = None, None, np.zeros((0, 3), np.int64)
     position = 0
     for element in elements:
-        found[element.name], position = _read_element(body, position, element, _ORDERS[encoding])
+        tables = []
+        for table in _tables(body, position, element, _ORDERS[encoding]):
+            position += table.nbytes
+            tables.append(table)
+        if element.name == "vertex":
+            vertices, normals = (_vectors(tables, element, names) for names in (("x", "y", "z"), ("nx", "ny", "nz")))
+        elif element.name == "face":
+            lists = [entry.name for entry in element.properties if entry.count_kind]
+            name = next((name for name in lists if name in ("vertex_indices", "vertex_index")), None)
+            triangles = _fans([table[name] for table in tables if name])
+            if element.size and not len(triangles):
+                raise InputError("its faces have no lists of three or more vertex_indices")
     if position != len(body):
         raise InputError("it is damaged: it holds more data than its header announces")
-    vertices = _vectors(found.get("vertex", {}), ("x", "y", "z"))
     if vertices is None:
         raise InputError("it has no vertices with x, y and z")
-    faces = found.get("face", {})
-    polygons = faces.get("vertex_indices", faces.get("vertex_index"))
-    triangles = _fans(polygons) if isinstance(polygons, _Lists) else np.zeros((0, 3), np.int64)
-    if len(triangles) == 0 and any(element.name == "face" and element.count for element in elements):
-        raise InputError("its faces have no lists of three or more vertex_indices")
-    return vertices, _vectors(found["vertex"], ("nx", "ny", "nz")), triangles
+    return vertices, normals, triangles
 
 
 def _header(content: bytes) -> tuple[str, list[_Element], bytes]:
@@ -81,14 +76,11 @@ def _header(content: bytes) -> tuple[str, list[_Element], bytes]:
                 case ["format", name, _] if name in _ORDERS:
                     encoding = name
                 case ["element", name, count] if int(count) >= 0:
-                    elements.append(_Element(name, int(count), ()))
+                    elements.append(_Element(name, int(count), []))
                 case ["property", "list", count_kind, kind, name]:
-                    last = elements[-1]
-                    new = _Property(name, _KINDS[kind], _KINDS[count_kind])
-                    elements[-1] = replace(last, properties=(*last.properties, new))
+                    elements[-1].properties.append(_Property(name, _KINDS[kind], _KINDS[count_kind]))
                 case ["property", kind, name]:
-                    last = elements[-1]
-                    elements[-1] = replace(last, properties=(*last.properties, _Property(name, _KINDS[kind])))
+                    elements[-1].properties.append(_Property(name, _KINDS[kind]))
                 case [] | ["comment" | "obj_info", *_]:
                     pass
                 case _:
@@ -98,8 +90,7 @@ def _header(content: bytes) -> tuple[str, list[_Element], bytes]:
     if not encoding:
         raise InputError("its header has no format line")
     names = [element.name for element in elements]
-    for element in elements:
-        names += [f"{element.name} {entry.name}" for entry in element.properties]
+    names += [f"{element.name} {entry.name}" for element in elements for entry in element.properties]
     if len(set(names)) < len(names):
         raise InputError("its header names an element or a property twice")
     skipped = len(head) + len(mark) + (2 if rest.startswith(b"\r\n") else 1)
@@ -113,99 +104,76 @@ def _as_doubles(body: bytes, elements: list[_Element]) -> tuple[bytes, list[_Ele
         numbers = np.fromiter(map(float, words), np.float64, len(words))
     except ValueError as error:
         raise InputError(f"it is damaged: {error}") from None
-    doubles = [
-        replace(element, properties=tuple(_Property(p.name, "f8", p.count_kind and "f8") for p in element.properties))
+    return numbers.tobytes(), [
+        element._replace(properties=[_Property(p.name, "f8", p.count_kind and "f8") for p in element.properties])
         for element in elements
     ]
-    return numbers.tobytes(), doubles
 
 
-def _read_element(body: bytes, position: int, element: _Element, order: str) -> tuple[_Columns, int]:
-    """Return the columns of an element that starts at `position`, and where it ends."""
-    if element.count == 0 or not element.properties:
-        return {}, position
-    # As a rule all lists of a property are as long as the first one; then the element is one array.
-    _, lengths = _read_row(body, position, element, order)
-    fields: list[tuple[str, str, tuple[int, ...]]] = []
-    for entry, length in zip(element.properties, lengths, strict=True):
-        if entry.count_kind:
-            fields.append((f"number of {entry.name}", order + entry.count_kind, ()))
-        fields.append((entry.name, order + entry.kind, (length,) if entry.count_kind else ()))
-    row = np.dtype(fields)
-    end = position + element.count * row.itemsize
-    table = np.frombuffer(body[position:end], row) if end <= len(body) else None
-    columns: _Columns = {}
-    for entry, length in zip(element.properties, lengths, strict=True):
-        if table is None:
-            break
-        if not entry.count_kind:
-            columns[entry.name] = table[entry.name]
-        elif (table[f"number of {entry.name}"] == length).all():
-            columns[entry.name] = _Lists(np.full(element.count, length), table[entry.name].reshape(-1))
-        else:
-            table = None
-    if table is not None:
-        return columns, end
-    if not any(entry.count_kind for entry in element.properties):
-        raise _truncated(element)
-    return _read_row_by_row(body, position, element, order)
+def _tables(body: bytes, position: int, element: _Element, order: str) -> Iterator[Shaped[np.ndarray, " r"]]:
+    """Yield the rows of an element that starts at `position`, as many at a time as have lists of the same lengths."""
+    left, most = (element.size if element.properties else 0), element.size
+    while left:
+        row = _row(body, position, element, order)
+        room = (len(body) - position) // row.itemsize
+        if room < 1:
+            raise InputError(
+                f"it is truncated: it has fewer than the {element.size} entries of {element.name} it announces"
+            )
+        table = np.frombuffer(body, row, min(left, most, room), position)
+        same = np.ones(len(table), dtype=bool)
+        for name, _, count_kind in element.properties:
+            if count_kind:
+                counts = table[f"number of {name}"]
+                same &= counts == counts[0]
+        table = table if same.all() else table[: same.argmin()]
+        yield table
+        position, left = position + table.nbytes, left - len(table)
+        most = 2 * len(table)  # else lists of changing lengths would be compared with all that follow, again and again
 
 
-def _read_row_by_row(body: bytes, position: int, element: _Element, order: str) -> tuple[_Columns, int]:
-    rows: list[list[np.ndarray]] = []
-    for _ in range(element.count):
-        values, _ = _read_row(body, position, element, order)
-        rows.append(values)
-        position += sum(value.nbytes for value in values)
-        position += sum(np.dtype(entry.count_kind).itemsize for entry in element.properties if entry.count_kind)
-    columns: _Columns = {}
-    for index, entry in enumerate(element.properties):
-        column = [row[index] for row in rows]
-        flat = np.concatenate(column)
-        columns[entry.name] = _Lists(np.array([len(value) for value in column]), flat) if entry.count_kind else flat
-    return columns, position
-
-
-def _read_row(body: bytes, position: int, element: _Element, order: str) -> tuple[list[np.ndarray], list[int]]:
-    """Return a row's values by property, and how many each has."""
-    values: list[np.ndarray] = []
-    for entry in element.properties:
+def _row(body: bytes, position: int, element: _Element, order: str) -> np.dtype:
+    """Return the type of the row that starts at `position`, in which each list has its length."""
+    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
+    for name, kind, count_kind in element.properties:
         length = 1
-        if entry.count_kind:
-            count = _take(body, position, element, order + entry.count_kind, 1)[0]
-            position += count.nbytes
-            if not 0 <= count <= len(body) or count != int(count):
-                raise InputError(f"it is damaged: a list of {element.name} has {count} entries")
+        if count_kind:
+            start, position = position, position + int(count_kind[1])
+            # A row that ends beyond the body is found by its size.
+            count = np.frombuffer(body, order + count_kind, 1, start)[0] if position <= len(body) else 0
+            if not 0 <= count <= max(len(body) - position, 0) / int(kind[1]) or count != int(count):
+                raise InputError(f"it is truncated or damaged: a list of {element.name} has {count} entries")
             length = int(count)
-        values.append(_take(body, position, element, order + entry.kind, length))
-        position += values[-1].nbytes
-    return values, [len(value) for value in values]
+            fields.append((f"number of {name}", order + count_kind))
+        fields.append((name, order + kind, (length,)) if count_kind else (name, order + kind))
+        position += length * int(kind[1])
+    return _row_type(tuple(fields))
 
 
-def _take(body: bytes, position: int, element: _Element, kind: str, count: int) -> np.ndarray:
-    if position + count * np.dtype(kind).itemsize > len(body):
-        raise _truncated(element)
-    return np.frombuffer(body, kind, count, position) if count else np.zeros(0, kind)
+@functools.lru_cache(maxsize=100)
+def _row_type(fields: tuple[tuple, ...]) -> np.dtype:
+    return np.dtype(list(fields))
 
 
-def _truncated(element: _Element) -> InputError:
-    return InputError(f"it is truncated: it has fewer than the {element.count} entries of {element.name} it announces")
+def _vectors(
+    tables: list[np.ndarray], element: _Element, names: tuple[str, str, str]
+) -> Float64[np.ndarray, "v 3"] | None:
+    if not tables or not {*names} <= {p.name for p in element.properties if not p.count_kind}:
+        return None
+    return np.concatenate([np.stack([table[name] for name in names], axis=1) for table in tables]).astype(np.float64)
 
 
-def _vectors(columns: _Columns, names: tuple[str, str, str]) -> Float64[np.ndarray, "v 3"] | None:
-    parts = [columns.get(name) for name in names]
-    arrays = [part for part in parts if isinstance(part, np.ndarray)]
-    with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN, which is found later
-        return np.stack(arrays, axis=1).astype(np.float64) if len(arrays) == 3 else None
-
-
-def _fans(polygons: _Lists) -> Int64[np.ndarray, "t 3"]:
-    """Cut polygons into triangles around their first corners."""
-    counts, values = polygons
-    whole = np.isfinite(values) & (np.abs(values) < _MAX_INDEX) & (values == np.rint(values))
-    if not whole.all():
-        raise InputError("it is damaged: a face names a vertex by something that is not a whole number")
-    number = np.maximum(counts - 2, 0)
-    first = np.repeat(np.cumsum(counts) - counts, number)
+def _fans(polygons: list[np.ndarray]) -> Int64[np.ndarray, "t 3"]:
+    """Cut polygons, given as tables of those of the same number of corners, into triangles around their first ones."""
+    if not polygons:
+        return np.zeros((0, 3), np.int64)
+    corners = np.concatenate([table.reshape(-1) for table in polygons])
+    if corners.dtype.kind == "f":
+        whole = np.isfinite(corners) & (np.abs(corners) < _MAX_INDEX) & (corners == np.rint(corners))
+        if not whole.all():
+            raise InputError("it is damaged: a face names a vertex by something that is not a whole number")
+    sizes = np.repeat([table.shape[1] for table in polygons], [len(table) for table in polygons])
+    number = np.maximum(sizes - 2, 0)
+    first = np.repeat(np.cumsum(sizes) - sizes, number)
     within = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number, number)
-    return values[np.stack([first, first + within + 1, first + within + 2], axis=1)].astype(np.int64)
+    return corners[np.stack([first, first + within + 1, first + within + 2], axis=1)].astype(np.int64)

@@ -10,7 +10,7 @@ centimetres and inches are too much alike to be told apart, so that the sentence
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -92,24 +92,25 @@ def length_problem(diameter: float, object_unit: str, scene: SceneSize) -> str |
     """
     if not 0 < diameter < math.inf:
         raise InputError(f"diameter is {diameter}, but must be above zero and finite")
-    fault = _fault(diameter, check_unit(object_unit), scene, scene.unit)
+    fault = _fault(diameter, check_unit(object_unit), scene)
     if fault is None:
         return None
-    candidates = []
-    for which, old in (("scene", scene.unit), ("object", object_unit)):
-        for unit in METRES:
-            pair = (unit, scene.unit) if which == "object" else (object_unit, unit)
-            if unit != old and _fault(diameter, pair[0], scene, pair[1]) is None:
-                oddity = _oddity(diameter, pair[0], scene, pair[1]) + _RARE_MISTAKE[which]
-                candidates.append((oddity, which, unit, METRES[unit] / METRES[old]))
+    changes = [("scene", unit, object_unit, replace(scene, unit=unit)) for unit in METRES if unit != scene.unit]
+    changes += [("object", unit, unit, scene) for unit in METRES if unit != object_unit]
+    candidates = sorted(
+        (_oddity(diameter, one, other) + _RARE_MISTAKE[which], which, unit)
+        for which, unit, one, other in changes
+        if _fault(diameter, one, other) is None
+    )
     if not candidates:
         return (
             f"{fault}, and no other unit of {', '.join(METRES)} makes them fit: check that both are what they should be"
         )
-    least, which, unit, factor = min(candidates)
+    (least, which, unit), *rest = candidates
+    factor = METRES[unit] / METRES[scene.unit if which == "scene" else object_unit]
     change = f"{factor:.4g} times larger" if factor > 1 else f"{1 / factor:.4g} times smaller"
-    other = [f"{_NAMES[name]} for the {what}" for odd, what, name, _ in sorted(candidates)[1:] if odd < least + _CLOSE]
-    too = f" ({', '.join(other)} would fit, too)" if other else ""
+    others = ", ".join(f"{_NAMES[name]} for the {what}" for oddity, what, name in rest if oddity < least + _CLOSE)
+    too = f" ({others} would fit, too)" if others else ""
     say = f"say --{'units' if which == 'scene' else 'object-units'} {unit}"
     return f"{fault}: the {which} would fit {change}, so its lengths are probably {_NAMES[unit]}{too}: {say}"
 
@@ -119,43 +120,40 @@ def length_doubt(diameter: float, object_unit: str, scene: SceneSize) -> str | N
 
     It is for scenes in which nothing was found: their lengths can be right, but need not be.
     """
-    oddities = {unit: _oddity(diameter, object_unit, scene, unit) for unit in METRES}
-    possible = [unit for unit in METRES if _fault(diameter, object_unit, scene, unit) is None]
-    likeliest = min(possible, key=lambda unit: oddities[unit], default=scene.unit)
-    if oddities[likeliest] >= oddities[scene.unit]:
+    scenes = [replace(scene, unit=unit) for unit in (scene.unit, *METRES)]
+    possible = [other for other in scenes if _fault(diameter, object_unit, other) is None]
+    likeliest = min(possible, key=lambda other: _oddity(diameter, object_unit, other), default=scene).unit
+    if likeliest == scene.unit:
         return None
     return f"if the scan's lengths are {_NAMES[likeliest]}, not {_NAMES[scene.unit]}, say --units {likeliest}"
 
 
-def _fault(diameter: float, object_unit: str, scene: SceneSize, scene_unit: str) -> str | None:
-    """Say what cannot be if the lengths of both were in the given units."""
-    factor = METRES[scene_unit] / METRES[object_unit]
-    extent, spacing = scene.extent * factor, scene.spacing * factor
+def _fault(diameter: float, object_unit: str, scene: SceneSize) -> str | None:
+    """Say what cannot be if the lengths of both were in their units."""
+    in_diameters = METRES[scene.unit] / METRES[object_unit] / diameter
     named = f"the object of {_digits(diameter)} {object_unit}"
-    shown = f"the scene of {_digits(scene.extent)} {scene_unit}"
-    if extent < _EXTENT[0] * diameter:
+    shown = f"the scene of {_digits(scene.extent)} {scene.unit}"
+    if scene.extent * in_diameters < _EXTENT[0]:
         return f"{named} is larger than {shown}"
-    if extent > _EXTENT[1] * diameter:
+    if scene.extent * in_diameters > _EXTENT[1]:
         return f"{named} is far too small for {shown}"
-    if diameter < _POINTS_ACROSS * spacing:
-        return f"{named} is too small for a scene whose points are {_digits(scene.spacing)} {scene_unit} apart"
-    if scene.distance is None:
+    if scene.spacing * in_diameters > 1 / _POINTS_ACROSS:
+        return f"{named} is too small for a scene whose points are {_digits(scene.spacing)} {scene.unit} apart"
+    if scene.distance is None or _DISTANCE[0] <= scene.distance * in_diameters <= _DISTANCE[1]:
         return None
-    away = f"a scene {_digits(scene.distance)} {scene_unit} away"
-    if scene.distance * factor < _DISTANCE[0] * diameter:
-        return f"{named} is too large for {away}"
-    return f"{named} is too small for {away}" if scene.distance * factor > _DISTANCE[1] * diameter else None
+    size = "large" if scene.distance * in_diameters < _DISTANCE[0] else "small"
+    return f"{named} is too {size} for a scene {_digits(scene.distance)} {scene.unit} away"
 
 
-def _oddity(diameter: float, object_unit: str, scene: SceneSize, scene_unit: str) -> float:
-    """Return how unusual lengths in these units would be: logarithms of what they miss, added."""
-    one, other = METRES[object_unit], METRES[scene_unit]
-    total = _beyond(scene.extent * other / (diameter * one), _USUAL_EXTENT)
-    total += _beyond(diameter * one, _USUAL_SIZES["object"]) + _beyond(scene.extent * other, _USUAL_SIZES["scene"])
-    if scene.distance is not None:
-        total += _beyond(scene.distance * other / (diameter * one), _USUAL_DISTANCE)
-        total += _beyond(scene.distance * other, _USUAL_SIZES["distance"])
-    return total + _RARE[object_unit] + _RARE[scene_unit]
+def _oddity(diameter: float, object_unit: str, scene: SceneSize) -> float:
+    """Return how unusual lengths in their units would be: logarithms of what they miss, added."""
+    size, extent = diameter * METRES[object_unit], scene.extent * METRES[scene.unit]
+    total = _RARE[object_unit] + _RARE[scene.unit] + _beyond(extent / size, _USUAL_EXTENT)
+    total += _beyond(size, _USUAL_SIZES["object"]) + _beyond(extent, _USUAL_SIZES["scene"])
+    if scene.distance is None:
+        return total
+    distance = scene.distance * METRES[scene.unit]
+    return total + _beyond(distance / size, _USUAL_DISTANCE) + _beyond(distance, _USUAL_SIZES["distance"])
 
 
 def _beyond(value: float, limits: tuple[float, float]) -> float:

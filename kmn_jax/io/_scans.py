@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import json
-import subprocess
-import sys
-import tempfile
+import math
 import warnings
 import zipfile
 from dataclasses import dataclass
@@ -18,7 +15,8 @@ from jaxtyping import Bool, Float, Float32
 
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import Camera, measured_points
-from kmn_jax.io._meshes import CLOUD_SUFFIXES, parse_points, read_file
+from kmn_jax.io._exr import parse_exr
+from kmn_jax.io._meshes import CLOUD_SUFFIXES, parse_mesh, read_file
 from kmn_jax.units import METRES, check_unit
 
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
@@ -27,8 +25,6 @@ _SATURATED = 65535  # of 16-bit depth, which some readers return as wider number
 _MOST_POINTS = 50_000_000
 _FARTHEST = 1e9  # units: renderers write 1e10 where they see nothing
 _DENSEST = 4096  # bytes of pixels from one byte of a file: compression that does more packs no measurement
-_SECONDS = 120  # for an EXR file, which takes less than one
-_DEPTH_NAMES = ("z", "depth")  # of a channel among others
 
 
 @dataclass(frozen=True)
@@ -71,18 +67,15 @@ def read_scan(path: str | Path, unit: str, camera: str | Path | None = None) -> 
         )
     content = read_file(path, "a scan")
     try:
-        if suffix in CLOUD_SUFFIXES:
-            points, normals = parse_points(content, suffix)
-            return _cloud(points, normals, unit)
-        if suffix in DEPTH_SUFFIXES:
-            intrinsics = _needed(camera)
-            return depth_scan(_exr(content) if suffix == ".exr" else _image(content), intrinsics, unit)
-        arrays = _npz(content) if suffix == ".npz" else _named(_npy(content))
-        has_camera = camera is not None or "K" in arrays
-        if "depth" in arrays and (has_camera or "points" not in arrays):
-            inside = camera is None and has_camera
-            given = _intrinsics(arrays["K"], "K", 1.0, None) if inside else _needed(camera)
-            return depth_scan(arrays["depth"], given, unit)
+        arrays = _arrays(content, suffix)
+        if "depth" in arrays and (camera is not None or "K" in arrays or "points" not in arrays):
+            if camera is not None:
+                intrinsics = read_camera(camera)
+            elif "K" in arrays:
+                intrinsics = _intrinsics(arrays["K"], "K", 1.0, None)
+            else:
+                raise InputError("it is a depth image, which needs a camera file with fx, fy, cx and cy")
+            return depth_scan(arrays["depth"], intrinsics, unit)
         return _cloud(arrays["points"], arrays.get("normals"), unit)
     except InputError as error:
         raise InputError(f"{path} cannot be used: {error}") from None
@@ -100,6 +93,13 @@ class DepthCamera:
     cy: float
     depth_scale: float
     size: tuple[int, int] | None  # width, height
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx, self.fy, self.depth_scale)
+        if not np.isfinite([*numbers, self.cx, self.cy]).all() or min(numbers) <= 0:
+            raise InputError(
+                f"fx, fy = {self.fx}, {self.fy} and depth_scale = {self.depth_scale} must be above zero, and all finite"
+            )
 
 
 def read_camera(path: str | Path) -> DepthCamera:
@@ -120,26 +120,12 @@ def read_camera(path: str | Path) -> DepthCamera:
             if len(matrix) != 9:
                 raise ValueError(f"cam_K has {len(matrix)} numbers instead of 9")
             return _intrinsics(matrix.reshape(3, 3), "cam_K", scale, size)
-        return _camera([float(found[name]) for name in ("fx", "fy", "cx", "cy")], scale, size)
+        fx, fy, cx, cy = (float(found[name]) for name in ("fx", "fy", "cx", "cy"))
+        return DepthCamera(fx, fy, cx, cy, scale, size)
     except KeyError as error:
         raise InputError(f"{path} cannot be used: it has no {error}, give fx, fy, cx and cy, or cam_K") from None
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise InputError(f"{path} cannot be used as a camera: {error}") from None
-
-
-def _camera(numbers: list[float], scale: float, size: tuple[int, int] | None) -> DepthCamera:
-    if not np.isfinite([*numbers, scale]).all() or min(numbers[:2]) <= 0 or scale <= 0:
-        raise InputError(
-            f"fx, fy = {numbers[0]}, {numbers[1]} and depth_scale = {scale} must be above zero, and all finite"
-        )
-    fx, fy, cx, cy = numbers
-    return DepthCamera(fx, fy, cx, cy, scale, size)
-
-
-def _needed(camera: str | Path | None) -> DepthCamera:
-    if camera is None:
-        raise InputError("it is a depth image, which needs a camera file with fx, fy, cx and cy")
-    return read_camera(camera)
 
 
 def _intrinsics(matrix: np.ndarray, name: str, scale: float, size: tuple[int, int] | None) -> DepthCamera:
@@ -148,7 +134,22 @@ def _intrinsics(matrix: np.ndarray, name: str, scale: float, size: tuple[int, in
     (fx, skew, cx), (zero, fy, cy), last = matrix.astype(float).tolist()
     if (skew, zero, *last) != (0, 0, 0, 0, 1):
         raise InputError(f"{name} must be fx 0 cx 0 fy cy 0 0 1, row by row: a camera with skew is not supported")
-    return _camera([fx, fy, cx, cy], scale, size)
+    return DepthCamera(fx, fy, cx, cy, scale, size)
+
+
+def _arrays(content: bytes, suffix: str) -> dict[str, np.ndarray]:
+    """Return what a file holds by name: points, perhaps with normals, or depth, perhaps with K."""
+    if suffix in CLOUD_SUFFIXES:
+        points, normals, _ = parse_mesh(content, suffix)
+        return {"points": points} if normals is None else {"points": points, "normals": normals}
+    if suffix == ".npz":
+        return _npz(content)
+    if suffix == ".npy":
+        array = _npy(content)
+        return {"depth" if array.ndim == 2 and array.shape[1] not in (3, 6) else "points": array}
+    if suffix == ".exr":
+        return {"depth": parse_exr(content, min(_MOST_POINTS, _DENSEST * len(content) // 2))}
+    return {"depth": _image(content)}
 
 
 def _image(content: bytes) -> np.ndarray:
@@ -178,104 +179,20 @@ def _check_size(count: int, itemsize: int, content: bytes) -> None:
         raise InputError(f"it is damaged: it announces {count} pixels or points, but has {len(content)} bytes")
 
 
-# A process of its own: a fault in the decoder, which is C++, ends only that, and what it prints goes nowhere.
-_EXR_PROGRAM = f"""
-import signal, sys
-if hasattr(signal, "alarm"):
-    signal.alarm({_SECONDS})
-import numpy as np
-import OpenEXR
-source, target, most = sys.argv[1:]
-with OpenEXR.File(source, header_only=True) as file:
-    announced = len(file.parts)
-    for part in file.parts:
-        low, high = (np.asarray(corner, dtype=float) for corner in part.header["dataWindow"])
-        if np.prod(high - low + 1) > int(most):
-            sys.exit(3)
-found, windows = [], []
-with OpenEXR.File(source, separate_channels=True) as file:
-    if not 0 < announced == len(file.parts):  # a part that cannot be decoded is missing, without an exception
-        sys.exit(4)
-    for part in file.parts:
-        for name, channel in part.channels.items():
-            found.append((name, channel.pixels))
-            windows.append([part.header["dataWindow"], part.header["displayWindow"]])
-pixels = {{f"p{{i}}": found[i][1] for i in range(len(found)) if found[i][1].dtype != object}}
-np.savez(target, names=np.array([name for name, _ in found], dtype=str), windows=np.array(windows), **pixels)
-"""
-
-
-def _exr(content: bytes) -> np.ndarray:
-    """Return the depth channel of an EXR file's content, zero where its window is smaller than the image."""
-    if content[:4] != b"\x76\x2f\x31\x01":
-        raise InputError("it is not an EXR file")
-    if importlib.util.find_spec("OpenEXR") is None:
-        raise InputError("EXR files need a reader that is not installed: pip install 'kmn_jax[data]'")
-    most = min(_MOST_POINTS, _DENSEST * len(content) // 2)
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            source, target = Path(folder, "depth.exr"), Path(folder, "depth.npz")
-            source.write_bytes(content)
-            command = [sys.executable, "-P", "-c", _EXR_PROGRAM, str(source), str(target), str(most)]
-            code = subprocess.run(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                timeout=_SECONDS,
-            ).returncode
-            if code == 3:
-                raise InputError(f"it announces more than {most} pixels: it is damaged or too large")
-            if code == 0 and target.exists():
-                with np.load(target) as found:
-                    return _depth_channel(dict(found))
-    except subprocess.TimeoutExpired:
-        raise InputError(f"its decoding takes longer than {_SECONDS} s: save it as TIFF") from None
-    except OSError as error:
-        raise InputError(f"it cannot be decoded: {error}") from None
-    raise InputError(f"it is truncated or damaged (the decoder ended with code {code})")
-
-
-def _depth_channel(found: dict[str, np.ndarray]) -> np.ndarray:
-    names = [str(name) for name in found["names"]]
-    chosen = [i for i, name in enumerate(names) if name.rpartition(".")[2].lower() in _DEPTH_NAMES]
-    if len(names) == 1:
-        chosen = [0]
-    if len(chosen) != 1 or f"p{chosen[0]}" not in found:
-        shown = ", ".join(names)[:80] or "none that can be read"
-        raise InputError(f"its channels are {shown}: save the depth alone, or as one channel called Z")
-    pixels, (low, high) = found[f"p{chosen[0]}"], found["windows"][chosen[0], 0].astype(np.int64)
-    start, end = found["windows"][chosen[0], 1].astype(np.int64)  # of the image that the camera took
-    if pixels.shape != tuple((high - low + 1)[::-1]):
-        raise InputError(f"its channel {names[chosen[0]]} is subsampled: save it in full")
-    first, last = np.maximum(low, start), np.minimum(high, end)
-    if (last < first).any() or int(np.prod(end - start + 1)) > _MOST_POINTS:
-        raise InputError("its data window does not lie in its display window: save it with one window")
-    image = np.zeros((end - start + 1)[::-1], dtype=pixels.dtype)
-    (left, top), (right, bottom) = first - start, last - start + 1
-    inner = first - low
-    image[top:bottom, left:right] = pixels[inner[1] :, inner[0] :][: bottom - top, : right - left]
-    return image
-
-
 def _npy(content: bytes) -> np.ndarray:
     """Return the array of an NPY file's content. No memory is taken for what its header only announces."""
     file = io.BytesIO(content)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of files by Python 2
-            version = np.lib.format.read_magic(file)
-            if version not in ((1, 0), (2, 0)):
-                raise ValueError(f"version {version} holds no plain numbers")
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, by_columns, dtype = read(file)
+            version = np.lib.format.read_magic(file)  # later ones hold no plain numbers
+            headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+            shape, by_columns, dtype = headers[version](file)
     except Exception as error:  # of many kinds: the header is Python text
         raise InputError(f"it is not a readable .npy file ({type(error).__name__}: {str(error)[:80]})") from None
     if dtype.kind not in "fiu":
         raise InputError(f"it does not hold numbers, but {dtype.name} values")
-    count = 1
-    for size in shape:
-        count *= size
+    count = math.prod(shape)
     if min(shape, default=0) < 0 or count * dtype.itemsize > len(content) - file.tell():
         raise InputError(f"it is not a readable .npy file: it is truncated, or not of shape {shape}"[:200])
     array = np.frombuffer(content, dtype, count, file.tell()) if count else np.zeros(0, dtype)
@@ -299,10 +216,6 @@ def _npz(content: bytes) -> dict[str, np.ndarray]:
     if not arrays.keys() & {"points", "depth"}:
         raise InputError(f"it holds {', '.join(names)[:80] or 'nothing'}, but neither points nor depth")
     return arrays
-
-
-def _named(array: np.ndarray) -> dict[str, np.ndarray]:
-    return {"depth" if array.ndim == 2 and array.shape[1] not in (3, 6) else "points": array}
 
 
 def _cloud(points: np.ndarray, normals: np.ndarray | None, unit: str) -> Scan:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from array import array
 
 import numpy as np
 from jaxtyping import Float64
@@ -12,13 +11,8 @@ from kmn_jax.errors import InputError
 
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER = 84
-_FACET = re.compile(
-    rb"^[ \t]*facet\b[^\n]*\n\s*outer\s+loop\s+"
-    + rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)\s+" * 3
-    + rb"endloop\s+endfacet[ \t]*$",
-    re.MULTILINE | re.IGNORECASE,
-)
-_WORD = re.compile(rb"^[ \t]*(?:vertex|facet|endfacet)\b", re.MULTILINE | re.IGNORECASE)
+_NAME = re.compile(rb"^[ \t]*(?:end)?solid\b[^\n]*$", re.MULTILINE | re.IGNORECASE)
+_FACET = b"facet normal ? ? ? outer loop vertex x x x vertex x x x vertex x x x endloop endfacet".split()
 
 
 def parse_stl(content: bytes) -> Float64[np.ndarray, "t 3 3"]:
@@ -31,7 +25,7 @@ def parse_stl(content: bytes) -> Float64[np.ndarray, "t 3 3"]:
         with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN, which is found later
             return np.frombuffer(content, _RECORD, offset=_HEADER)["corners"].astype(np.float64)
     if content.lstrip()[:5].lower() == b"solid":
-        return _parse_text(content.replace(b"\r\n", b"\n").replace(b"\r", b"\n"))
+        return _parse_text(content.replace(b"\r\n", b"\n").replace(b"\r", b"\n").rstrip(b"\0 \t\n"))
     raise InputError(
         f"it has {len(content)} bytes"
         + ("" if declared is None else f", but announces {declared} triangles, which take {_HEADER + 50 * declared}")
@@ -40,14 +34,14 @@ def parse_stl(content: bytes) -> Float64[np.ndarray, "t 3 3"]:
 
 
 def _parse_text(text: bytes) -> Float64[np.ndarray, "t 3 3"]:
-    if not text.rstrip(b"\0 \t\n").rpartition(b"\n")[2].lstrip().lower().startswith(b"endsolid"):
+    if not text.rpartition(b"\n")[2].lstrip().lower().startswith(b"endsolid"):
         raise InputError("it is truncated: it does not end with 'endsolid'")
-    numbers = array("d")
+    words = _NAME.sub(b"", text).lower().split()
+    columns = [(name, words[i :: len(_FACET)]) for i, name in enumerate(_FACET)]
+    if len(words) % len(_FACET) or any(len(name) > 1 and {*column} - {name} for name, column in columns):
+        raise InputError("it is damaged: a facet is not one loop of three vertices with three numbers each")
     try:
-        for facet in _FACET.finditer(text):
-            numbers.extend(map(float, facet.groups()))
+        numbers = [list(map(float, column)) for name, column in columns if name == b"x"]
     except ValueError as error:
         raise InputError(f"it is damaged: {error}") from None
-    if 5 * len(numbers) != 9 * sum(1 for _ in _WORD.finditer(text)):  # facet, 3 x vertex, endfacet: 9 numbers
-        raise InputError("it is damaged: a facet is not one loop of three vertices with three numbers each")
-    return np.array(numbers, dtype=np.float64).reshape(-1, 3, 3)
+    return np.array(numbers, dtype=np.float64).T.reshape(-1, 3, 3)

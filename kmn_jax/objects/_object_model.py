@@ -5,14 +5,13 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from kmn_jax.errors import InputError
 from kmn_jax.io import check_triangles, read_mesh
-from kmn_jax.objects._surface import OuterSurface, outer_surface
+from kmn_jax.objects._surface import OuterSurface, RayScene, outer_surface
 from kmn_jax.objects._symmetry import Distance, Symmetries, find_symmetries
 from kmn_jax.units import METRES, check_unit
 
@@ -26,15 +25,15 @@ class ObjectConfig:
 
     num_points: int = 2048  # Poisson-disk points on the outer surface; 4,096 to 16,384 for training packs
     symmetry_tolerance: float = 0.02  # share of the diameter
-    seed: int = 0
+    random_seed: int = 0
 
     def __post_init__(self) -> None:
         if self.num_points < 64:
             raise InputError(f"num_points = {self.num_points} cannot stand for a surface: take 64 or more")
         if not 0 < self.symmetry_tolerance <= 0.2:
             raise InputError(f"symmetry_tolerance = {self.symmetry_tolerance} must be above 0 and at most 0.2")
-        if self.seed < 0:
-            raise InputError(f"seed = {self.seed} must be 0 or more")
+        if self.random_seed < 0:
+            raise InputError(f"random_seed = {self.random_seed} must be 0 or more")
 
 
 @dataclass(frozen=True)
@@ -112,20 +111,10 @@ def object_from_mesh(
     digest: str | None = None,
 ) -> ObjectModel:
     """Make an object model of a mesh, watertight or not. Raises InputError if it has no surface to see, or is flat."""
-    import open3d
-
     config = config or ObjectConfig()
     check_triangles(vertices, triangles)
-    outer = outer_surface(vertices, triangles, config.num_points, config.seed)
+    outer = outer_surface(vertices, triangles, config.num_points, config.random_seed)
     _refuse_flat(outer.vertices)
-    minimum, maximum = outer.vertices.min(axis=0), outer.vertices.max(axis=0)
-    middle, scale = (minimum + maximum) / 2, float(np.linalg.norm(maximum - minimum))
-    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(((outer.vertices - middle) / scale).astype(np.float32), outer.triangles.astype(np.uint32))
-
-    def distance(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        return scale * scene.compute_distance(((points - middle) / scale).astype(np.float32)).numpy()
-
     corners = outer.vertices[outer.triangles]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     center = (area[:, None] * corners.mean(axis=1)).sum(axis=0) / area.sum()
@@ -133,8 +122,8 @@ def object_from_mesh(
     # The second moments of a triangle: its corners' and their sum's outer products, by the exact formula.
     sums = offsets.sum(axis=1)
     moments = np.einsum("t,tci,tcj->ij", area, offsets, offsets) + np.einsum("t,ti,tj->ij", area, sums, sums)
-    shape = _Shape(center, moments / (12 * area.sum()), distance, config.symmetry_tolerance)
-    return _model(name, unit, outer, shape, digest or _digest(vertices, triangles))
+    shape = (center, moments / (12 * area.sum()), RayScene(outer.vertices, outer.triangles).distance)
+    return _model(name, unit, outer, shape, config.symmetry_tolerance, digest or _digest(vertices, triangles))
 
 
 def object_from_cloud(
@@ -162,24 +151,25 @@ def object_from_cloud(
             f"the cloud has {len(distinct)} different points, but {config.num_points} are needed: scan it more densely"
         )
     _refuse_flat(points[distinct])
-    generator = np.random.default_rng(config.seed)
+    generator = np.random.default_rng(config.random_seed)
     if len(distinct) > _MAX_CLOUD:
         distinct = np.sort(generator.choice(distinct, _MAX_CLOUD, replace=False))
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points[distinct].astype(np.float64)))
-    given = normals is not None and bool(np.isfinite(normals).all() and np.any(normals, axis=1).all())
-    if normals is not None and given:
+    if normals is not None and not (np.isfinite(normals).all() and np.any(normals, axis=1).all()):
+        normals = None
+    if normals is not None:
         cloud.normals = open3d.utility.Vector3dVector(normals[distinct].astype(np.float64))
         cloud.normalize_normals()
     else:
         cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(30))
     if len(distinct) > 5 * config.num_points:
         cloud = cloud.select_by_index(np.sort(generator.choice(len(distinct), 5 * config.num_points, replace=False)))
-    if not given:
+    if normals is None:
         cloud.orient_normals_consistent_tangent_plane(30)
     thinned = cloud.farthest_point_down_sample(config.num_points)
     kept, directions = np.asarray(thinned.points), np.asarray(thinned.normals)
     center = kept.mean(axis=0)
-    if not given and ((kept - center) * directions).sum() < 0:
+    if normals is None and ((kept - center) * directions).sum() < 0:
         directions = -directions
     size = float(np.linalg.norm(np.ptp(kept, axis=0)))
     tree, spacing = cKDTree(points[distinct]), float(np.median(cKDTree(kept).query(kept, k=2)[0][:, 1]))
@@ -192,20 +182,18 @@ def object_from_cloud(
         hidden_share=0.0,
     )
     tolerance = min(config.symmetry_tolerance + spacing / size, 0.2)
-    shape = _Shape(center, np.cov(kept.T, bias=True), lambda moved: tree.query(moved)[0], tolerance)
-    return _model(name, unit, outer, shape, digest or _digest(points))
+    shape = (center, np.cov(kept.T, bias=True), lambda moved: tree.query(moved)[0])
+    return _model(name, unit, outer, shape, tolerance, digest or _digest(points))
 
 
-class _Shape(NamedTuple):
-    """What symmetries are found from; see `find_symmetries`."""
-
-    center: Float[np.ndarray, "3"]
-    moments: Float[np.ndarray, "3 3"]
-    distance: Distance
-    tolerance: float
-
-
-def _model(name: str, unit: str, outer: OuterSurface, shape: _Shape, digest: str) -> ObjectModel:
+def _model(
+    name: str,
+    unit: str,
+    outer: OuterSurface,
+    shape: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], Distance],  # centre, moments, distance from it
+    tolerance: float,
+    digest: str,
+) -> ObjectModel:
     import jax.numpy as jnp
     from scipy.spatial.distance import cdist
 
@@ -213,11 +201,11 @@ def _model(name: str, unit: str, outer: OuterSurface, shape: _Shape, digest: str
 
     extremes = _extremes(outer.vertices)
     diameter = float(cdist(extremes, extremes).max())
+    center, moments, distance = shape
     # Centred and of unit size: float32 then has digits to tell the distances apart.
-    scaled = jnp.asarray((outer.points - shape.center) / diameter, jnp.float32)
+    scaled = jnp.asarray((outer.points - center) / diameter, jnp.float32)
     order = np.asarray(farthest_point_indices(scaled, len(scaled)))
     points = outer.points[order]
-    center, moments, distance, tolerance = shape
     # Corners are where a wrong rotation shows most, but no random point hits one; a cloud's outermost points are noise.
     probes = (
         np.concatenate([points.astype(np.float64), extremes]) if len(outer.triangles) else points.astype(np.float64)
@@ -255,14 +243,10 @@ def _covered_area(points: Float[np.ndarray, "n 3"]) -> float:
 
 def _extremes(vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "h 3"]:
     """Return the vertices of the convex hull, or of large ones about 3,000 that leave out 0.1% of its size at most."""
-    from scipy.spatial import ConvexHull, QhullError
+    from scipy.spatial import ConvexHull
 
     center = vertices.mean(axis=0)
-    centered = vertices - center
-    try:
-        hull = centered[ConvexHull(centered).vertices]
-    except QhullError:  # flat: then the hull joggled out of the plane serves
-        hull = centered[ConvexHull(centered, qhull_options="QJ").vertices]
+    hull = (vertices - center)[ConvexHull(vertices - center).vertices]
     if len(hull) > _MAX_HULL:
         directions = np.random.default_rng(0).normal(size=(_MAX_HULL, 3))
         hull = hull[np.unique((directions @ hull.T).argmax(axis=1))]

@@ -33,13 +33,13 @@ class OuterSurface:
 
 
 def outer_surface(
-    vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], num_points: int, seed: int = 0
+    vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], num_points: int, random_seed: int = 0
 ) -> OuterSurface:
     """Return the part of a mesh that is visible from outside, and `num_points` Poisson-disk points on it.
 
     Meshes need not be watertight; on an open sheet, seen from both sides, the given winding says which side is
-    outer. The same input and seed give the same bits. Above 100,000 triangles the mesh is simplified first, which
-    moves the surface by about 0.1% of its diagonal, and edges by 0.2%, so that time stays bounded.
+    outer. The same input and random seed give the same bits. Above 100,000 triangles the mesh is simplified first,
+    which moves the surface by about 0.1% of its diagonal, and edges by 0.2%, so that time stays bounded.
     Raises InputError if there is no area to see.
     """
     simplified = len(triangles) > _MAX_TRIANGLES
@@ -50,22 +50,17 @@ def outer_surface(
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     doubled_area = np.linalg.norm(cross, axis=1)
     directions = cross / doubled_area[:, None]
-    extent = np.ptp(vertices, axis=0)
-    diagonal = float(np.linalg.norm(extent))
-    cast = _EscapeCounter(vertices, triangles, diagonal)
-    generator = np.random.default_rng(seed)
-    owners, points, escapes = [np.zeros(0, np.int64)], [np.zeros((0, 3))], [np.zeros((0, 2), np.int64)]
-    visible = 0
+    escapes = RayScene(vertices, triangles).escapes
+    generator = np.random.default_rng(random_seed)
+    samples, visible = [], 0
     for _ in range(6):  # hidden area costs more rounds; what is nearly all hidden is not a part
-        batch = 5 * num_points
-        owner = generator.choice(len(triangles), size=batch, p=doubled_area / doubled_area.sum())
+        owner = generator.choice(len(triangles), size=5 * num_points, p=doubled_area / doubled_area.sum())
         point = _on_triangles(generator, corners[owner])
-        count = cast(point, directions[owner])
-        owners, points, escapes = [*owners, owner], [*points, point], [*escapes, count]
-        visible += int((count.max(axis=1) >= _MIN_ESCAPES).sum())
+        samples.append((owner, point, escapes(point, directions[owner])))
+        visible += int((samples[-1][2].max(axis=1) >= _MIN_ESCAPES).sum())
         if visible >= 4 * num_points:
             break
-    owner, point, count = np.concatenate(owners), np.concatenate(points), np.concatenate(escapes)
+    owner, point, count = (np.concatenate(parts) for parts in zip(*samples, strict=True))
     seen = count.max(axis=1) >= _MIN_ESCAPES
     if seen.sum() < num_points:
         raise InputError(f"only {seen.mean():.0%} of the mesh can be seen from outside: that is not a part's surface")
@@ -75,7 +70,7 @@ def outer_surface(
     unsampled = np.bincount(owner, minlength=len(triangles)) == 0
     # Nearly all triangles of a simplified mesh are small and have no sample: fewer rays have to do for them.
     rays, enough = (_RAYS_PER_SIDE // 4, 1) if simplified else (_RAYS_PER_SIDE, _MIN_ESCAPES)
-    total[unsampled] = cast(corners[unsampled].mean(axis=1), directions[unsampled], rays)
+    total[unsampled] = escapes(corners[unsampled].mean(axis=1), directions[unsampled], rays)
     best = np.zeros(len(triangles), np.int64)
     np.maximum.at(best, owner, count.max(axis=1))
     kept = best >= _MIN_ESCAPES
@@ -96,20 +91,25 @@ def outer_surface(
     )
 
 
-class _EscapeCounter:
-    """Count, for points on a mesh and both sides, the rays that reach infinity."""
+class RayScene:
+    """A mesh to cast rays at. It is traced in float32: centred and scaled, whose digits then go to the shape."""
 
-    def __init__(self, vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], diagonal: float) -> None:
+    def __init__(self, vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]) -> None:
         import open3d
 
-        # Rays are traced in float32: centred and scaled, its digits go to the shape.
-        self.center, self.scale = (vertices.min(axis=0) + vertices.max(axis=0)) / 2, 1 / diagonal
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        self.center, self.size = (low + high) / 2, float(np.linalg.norm(high - low))
         self.scene = open3d.t.geometry.RaycastingScene(nthreads=1)
         self.scene.add_triangles(self._local(vertices), triangles.astype(np.uint32))
 
-    def __call__(
+    def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Return the distances of points from the mesh."""
+        return self.size * self.scene.compute_distance(self._local(points)).numpy()
+
+    def escapes(
         self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"], count: int = _RAYS_PER_SIDE
     ) -> Int[np.ndarray, "n 2"]:
+        """Count, for points on the mesh and both of its sides, the rays that reach infinity."""
         starts, result = self._local(points), np.zeros((len(points), 2), np.int64)
         for side, sign in enumerate((1.0, -1.0)):
             normals = (sign * directions).astype(np.float32)
@@ -122,7 +122,7 @@ class _EscapeCounter:
         return result
 
     def _local(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        return ((points - self.center) * self.scale).astype(np.float32)
+        return ((points - self.center) / self.size).astype(np.float32)
 
 
 def _hemisphere(normals: Float[np.ndarray, "n 3"], count: int) -> Float[np.ndarray, "n r 3"]:
@@ -163,9 +163,7 @@ def _simplify(
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "s 3"]]:
     import open3d
 
-    used = np.zeros(len(vertices), dtype=bool)
-    used[triangles] = True
-    diagonal = float(np.linalg.norm(np.ptp(vertices[used], axis=0)))
+    diagonal = float(np.linalg.norm(np.ptp(vertices[triangles.reshape(-1)], axis=0)))
     if not diagonal > 0:
         return vertices, triangles
     mesh = open3d.geometry.TriangleMesh(

@@ -10,10 +10,9 @@ rotation groups (cyclic, dihedral, tetrahedral, octahedral, icosahedral), all of
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -21,6 +20,7 @@ from jaxtyping import Float
 from kmn_jax.errors import InputError
 
 Distance = Callable[[np.ndarray], np.ndarray]  # (n, 3) points to (n,) distances from the surface
+_Spin = tuple[np.ndarray, int]  # an axis and its order
 
 _MAX_ORDER = 36
 _PRIMES = (2, 3, 5, 7, 11, 13)  # every order tried is a multiple of one of these
@@ -77,19 +77,19 @@ def find_symmetries(
     spins: list[_Spin] = []
     for prime in (5, 3, 2) if isotropic else _PRIMES:
         for start in search.nearly(axes, prime):
-            if any(abs(start @ spin.axis) > _SAME_AXIS and spin.order % prime == 0 for spin in spins):
+            if any(abs(start @ axis) > _SAME_AXIS and order % prime == 0 for axis, order in spins):
                 continue
             axis = search.refined(start, prime)
-            if search.is_continuous(axis):
+            if search.all_hold(_turn(axis, order) for order in range(2, _MAX_ORDER + 1)):
                 return search.about_continuous(axis, tolerance)
             order = search.order_about(axis)
             if order > prime:  # the higher order knows the axis better
                 finer = search.refined(axis, order)
-                axis = finer if search.all_hold(_cyclic(finer, order)) else axis
+                axis = finer if search.group_holds(_cyclic(finer, order)) else axis
             if order > 1:
-                spins.append(_Spin(axis, order))
+                spins.append((axis, order))
     if not isotropic:
-        spins += [_Spin(vectors[:, index], 1) for index in range(3) if equal[index]]
+        spins += [(vectors[:, index], 1) for index in range(3) if equal[index]]
     return Symmetries(search.largest_group(spins), np.zeros((0, 3)), center, tolerance)
 
 
@@ -98,11 +98,6 @@ def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarr
     x, y, z = axis
     skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
-
-
-class _Spin(NamedTuple):
-    axis: np.ndarray
-    order: int
 
 
 class _Search:
@@ -114,22 +109,22 @@ class _Search:
         order = np.argsort(-np.linalg.norm(self.points, axis=1), kind="stable")
         self.coarse = self.points[np.concatenate([order[:_COARSE_POINTS], order[:: max(1, len(order) // 256)]])]
 
-    def deviation(self, rotation: Float[np.ndarray, "3 3"], points: Float[np.ndarray, "n 3"] | None = None) -> float:
-        points = self.points if points is None else points
-        return float(self.distance(points @ rotation.T + self.center).max())
-
     def deviations(
         self, rotations: Float[np.ndarray, "r 3 3"], points: Float[np.ndarray, "n 3"]
     ) -> Float[np.ndarray, " r"]:
-        turned = np.einsum("rij,nj->rni", rotations, points).reshape(-1, 3) + self.center
-        return self.distance(turned).reshape(len(rotations), -1).max(axis=1)
+        turned = points @ rotations.transpose(0, 2, 1) + self.center
+        return self.distance(turned.reshape(-1, 3)).reshape(len(rotations), -1).max(axis=1)
 
-    def holds(self, rotation: Float[np.ndarray, "3 3"]) -> bool:
-        return self.deviation(rotation, self.coarse) <= self.bound and self.deviation(rotation) <= self.bound
+    def all_hold(self, rotations: Iterable[Float[np.ndarray, "3 3"]]) -> bool:
+        return all(
+            self.deviations(rotation[None], points)[0] <= self.bound
+            for rotation in rotations
+            for points in (self.coarse, self.points)
+        )
 
-    def is_continuous(self, axis: Float[np.ndarray, "3"]) -> bool:
-        orders = range(2, _MAX_ORDER + 1)
-        return all(self.holds(_turn(axis, order)) for order in orders)
+    def group_holds(self, group: Float[np.ndarray, "s 3 3"]) -> bool:
+        middle = len(group) // 2  # about an axis, the rotation by about half a turn tells most
+        return self.all_hold((*group[middle:], *group[1:middle]))
 
     def order_about(self, axis: Float[np.ndarray, "3"]) -> int:
         """Return the largest order whose rotations all hold, and fit clearly better than any others about the axis.
@@ -140,7 +135,7 @@ class _Search:
         limit = None
         for order in range(_MAX_ORDER, 1, -1):
             group = _cyclic(axis, order)
-            if self.deviation(group[1], self.coarse) > self.bound or not self.all_hold(group):
+            if not self.group_holds(group):
                 continue
             if limit is None:
                 some = np.stack([rotation_about(axis, angle) for angle in np.radians(np.arange(5, 181, 5))])
@@ -152,8 +147,8 @@ class _Search:
     def about_continuous(self, axis: Float[np.ndarray, "3"], tolerance: float) -> Symmetries:
         """Return the symmetries of a body of revolution: about its axis, maybe turned over, maybe a sphere."""
         across = _across(axis)[0]
-        turned_over = [_half_turn(across)] if self.holds(_half_turn(across)) else []
-        if turned_over and all(self.holds(rotation_about(across, angle)) for angle in (0.4, 1.1, 2.0)):
+        turned_over = [_turn(across, 2)] if self.all_hold([_turn(across, 2)]) else []
+        if turned_over and self.all_hold(rotation_about(across, angle) for angle in (0.4, 1.1, 2.0)):
             return Symmetries(np.eye(3)[None], np.eye(3), self.center, tolerance)
         return Symmetries(np.stack([np.eye(3), *turned_over]), axis[None], self.center, tolerance)
 
@@ -173,7 +168,7 @@ class _Search:
         self, axis: Float[np.ndarray, "3"], order: int, about: Float[np.ndarray, "3"] | None = None
     ) -> Float[np.ndarray, "3"]:
         """Turn an axis, in any way or only about another one, to where its rotation fits best, by halving steps."""
-        best, step = self.deviation(_turn(axis, order), self.coarse), np.radians(1.5)
+        best, step = self.deviations(_turn(axis, order)[None], self.coarse)[0], np.radians(1.5)
         while step > np.radians(0.02):
             sides = _across(axis) if about is None else (np.cross(about, axis),)
             trials = [axis + step * way for side in sides for way in (side, -side)]
@@ -185,32 +180,30 @@ class _Search:
                 step /= 2
         return axis
 
-    def all_hold(self, group: Float[np.ndarray, "s 3 3"]) -> bool:
-        middle = len(group) // 2  # about an axis, the rotation by about half a turn tells most
-        return all(self.holds(rotation) for rotation in (*group[middle:], *group[1:middle]))
-
     def largest_group(self, spins: list[_Spin]) -> Float[np.ndarray, "s 3 3"]:
         """Return the largest group, all of whose members hold, to which axes and their orders lead."""
         for order, angle in _POLYHEDRAL:
-            axes = [spin.axis for spin in spins if spin.order % order == 0]
+            axes = [axis for axis, multiple in spins if multiple % order == 0]
             for first, second in combinations(axes, 2):
                 second = second if first @ second > 0 else -second
-                if abs(np.arccos(min(1.0, first @ second)) - angle) < np.radians(6):
+                if abs(np.arccos(min(1.0, float(first @ second))) - angle) < np.radians(6):
                     group = _polyhedral(first, second, order, angle)
-                    if self.all_hold(group):
+                    if self.group_holds(group):
                         return group
         best = np.eye(3)[None]
-        for axis, order in sorted(spins, key=lambda spin: -spin.order):
+        for axis, order in sorted(spins, key=lambda spin: -spin[1]):
             if 2 * order <= len(best):
                 break
             if order > len(best):
                 best = _cyclic(axis, order)
-            others = [spin.axis for spin in spins if abs(spin.axis @ axis) < 0.1]
-            for way in self.nearly(np.stack([*others, *_around(axis, 180)]), 2):
+            others = [other for other, _ in spins if abs(other @ axis) < 0.1]
+            first, second = _across(axis)
+            angles = np.radians(np.arange(180))[:, None]  # half a turn suffices, as axes have no sign
+            for way in self.nearly(np.stack([*others, *(np.cos(angles) * first + np.sin(angles) * second)]), 2):
                 way = way - way @ axis * axis
-                turn = _half_turn(self.refined(way / np.linalg.norm(way), 2, about=axis))
+                turn = _turn(self.refined(way / np.linalg.norm(way), 2, about=axis), 2)
                 dihedral = np.concatenate([_cyclic(axis, order), turn @ _cyclic(axis, order)])
-                if self.all_hold(dihedral):
+                if self.group_holds(dihedral):
                     best = dihedral
                     break
         return best
@@ -218,10 +211,6 @@ class _Search:
 
 def _turn(axis: Float[np.ndarray, "3"], order: int) -> Float[np.ndarray, "3 3"]:
     return rotation_about(axis, 2 * np.pi / order)
-
-
-def _half_turn(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    return 2 * np.outer(axis, axis) - np.eye(3)
 
 
 def _cyclic(axis: Float[np.ndarray, "3"], order: int) -> Float[np.ndarray, "s 3 3"]:
@@ -241,13 +230,6 @@ def _polyhedral(
             if np.einsum("nij,ij->n", np.stack(group), product).max() < 2.9:  # 3 for equal ones, 2.6 for neighbours
                 group.append(product)
     return np.stack(group)
-
-
-def _around(axis: Float[np.ndarray, "3"], count: int) -> Float[np.ndarray, "n 3"]:
-    """Return directions across an axis; half a turn of them suffices, as axes have no sign."""
-    first, second = _across(axis)
-    angles = np.pi * np.arange(count) / count
-    return np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second
 
 
 def _across(axis: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:

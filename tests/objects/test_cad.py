@@ -19,7 +19,7 @@ from tests.reference.solids import area, block, joined, torus
 CONFIG = ObjectConfig(num_points=256)
 PART = joined(block((0, 0, 0), (40, 15, 10)), block((2, 2, 2), (12, 12, 30)))
 R_FILE_BOX = Rotation.random(rng=np.random.default_rng(1)).as_matrix()
-STEP = Path(__file__).parent / "files" / "box.step"
+STEP = Path(__file__).parents[1] / "io" / "files" / "box.step"
 
 
 def saved(folder, name, mesh):
@@ -99,7 +99,7 @@ def test_step_file():
 def test_the_same_file_gives_the_same_bits(part, folder):
     again = load_object(folder / "bracket.stl", config=CONFIG)
     assert facts(again) == facts(part)
-    other = load_object(folder / "bracket.stl", config=replace(CONFIG, seed=1))
+    other = load_object(folder / "bracket.stl", config=replace(CONFIG, random_seed=1))
     assert not np.array_equal(other.points, part.points)
     assert other.diameter == part.diameter
     arrays = object_from_mesh("a", *PART, "mm", CONFIG)
@@ -245,7 +245,7 @@ def test_arrays_are_checked_like_files():
         ({"num_points": 63}, "64 or more"),
         ({"symmetry_tolerance": 0.0}, "symmetry_tolerance"),
         ({"symmetry_tolerance": 0.3}, "symmetry_tolerance"),
-        ({"seed": -1}, "seed"),
+        ({"random_seed": -1}, "random_seed"),
     ],
 )
 def test_configs_that_make_no_sense(settings, message):

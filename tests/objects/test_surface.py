@@ -109,11 +109,14 @@ def test_points_keep_their_distance():
 
 
 def test_the_same_seed_gives_the_same_bits():
-    first, second = outer_surface(*OVERLAPPING, POINTS, seed=3), outer_surface(*OVERLAPPING, POINTS, seed=3)
+    first, second = (
+        outer_surface(*OVERLAPPING, POINTS, random_seed=3),
+        outer_surface(*OVERLAPPING, POINTS, random_seed=3),
+    )
     for name in ("vertices", "triangles", "points", "normals"):
         assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
     assert (first.area, first.hidden_share) == (second.area, second.hidden_share)
-    assert not np.array_equal(first.points, outer_surface(*OVERLAPPING, POINTS, seed=4).points)
+    assert not np.array_equal(first.points, outer_surface(*OVERLAPPING, POINTS, random_seed=4).points)
 
 
 @pytest.mark.parametrize(("scale", "offset"), [(1e-3, 0), (1e3, 0), (1.0, 2e4), (1e-3, 20.0), (1e-9, 0), (1e9, 0)])
