@@ -31,12 +31,10 @@ from kmn_jax.geometry._se3 import (
     translation_between,
 )
 from kmn_jax.geometry._smoothing import SmoothConfig, smoothed
-from kmn_jax.geometry._subsets import Selection, radius_crop, voxel_thin
 
 __all__ = [
     "Camera",
     "Intrinsics",
-    "Selection",
     "SmoothConfig",
     "compose",
     "depth_normals",
@@ -59,7 +57,6 @@ __all__ = [
     "orient_to_camera",
     "pose_error",
     "quaternion_to_matrix",
-    "radius_crop",
     "random_pose",
     "random_rotation",
     "rotate_vectors",
@@ -71,5 +68,4 @@ __all__ = [
     "squared_distances",
     "transform_points",
     "translation_between",
-    "voxel_thin",
 ]
