@@ -105,10 +105,11 @@ class _Panels:
         self.keypoint = np.concatenate([np.zeros(0, dtype=int), *(crop.keypoint for crop in crops)])
         self.points = self._in_view(np.concatenate([np.zeros((0, 3)), *(crop.points for crop in crops)]))
         copies = [self._in_view(placed(pose.T_scene_object, part.points)) for pose in found.poses]
+        self.grey = 0.55 + 0.38 * self.scan.brightness[..., None]
         self.box = _measured_box(view)
         self.canvas = _zoomed(view.camera, self.box, image_places(view.camera, np.concatenate([self.points, *copies])))
 
-    def _in_view(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def _in_view(self, points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s 3"]:
         return placed(self.T_view_scene, points.astype(np.float64))
 
     def draw_scan(self, axis: Any) -> None:
@@ -133,7 +134,7 @@ class _Panels:
         axis.set_title(title)
 
     def draw_segmentation(self, axis: Any) -> None:
-        self._draw_scan(axis, 0.55 + 0.38 * self.scan.brightness[..., None])
+        self._draw_scan(axis, self.grey)
         colors = np.where(self.on_object[:, None], self.pose_colors[self.crop_of], NOT_THE_PART)
         self._draw_points(axis, colors, self.on_object)
         share = self.on_object.sum() / max(1, len(self.on_object))
@@ -156,7 +157,7 @@ class _Panels:
         axis.set_title("Points of the crops against the truth")
 
     def draw_keypoints(self, axis: Any) -> None:
-        self._draw_scan(axis, 0.55 + 0.38 * self.scan.brightness[..., None])
+        self._draw_scan(axis, self.grey)
         colors = distinct_colors(self.part.num_keypoints)[self.keypoint]
         self._draw_points(axis, colors, np.where(self.on_object, 0, -1))
         axis.set_title("Likeliest keypoint of points on a copy")
@@ -164,18 +165,18 @@ class _Panels:
     def draw_poses(self, axis: Any) -> None:
         import matplotlib.patheffects as effects
 
-        self._draw_scan(axis, 0.55 + 0.38 * self.scan.brightness[..., None])
+        self._draw_scan(axis, self.grey)
         image = np.zeros((self.canvas.height, self.canvas.width, 4))
         nearest = np.full(image.shape[:2], np.inf)
         ranked = enumerate(zip(self.found.poses, self.pose_colors, strict=True), start=1)
         # Likely poses come last: they are in front of all others, whatever their depth.
         for rank, (pose, color) in sorted(ranked, key=lambda row: row[1][0].probability >= LIKELY):
-            self._paint(pose, color, image, nearest)
             likely = pose.probability >= LIKELY
-            center = self._in_view(placed(pose.T_scene_object, center_of(self.part)[None]))
+            self._paint(pose, color, image, nearest)
+            center = self._in_view(placed(pose.T_scene_object, center_of(self.part)))
             axis.annotate(
                 f"{rank}: {pose.probability:.2f}",
-                image_places(self.canvas.camera, center)[0],
+                image_places(self.canvas.camera, center),
                 ha="center",
                 va="center",
                 fontsize=10 if likely else 8.5,

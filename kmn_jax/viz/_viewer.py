@@ -22,8 +22,6 @@ from kmn_jax.viz._shading import as_bytes, distinct_colors
 from kmn_jax.viz._viewer_scene import PageScene, PoseNodes
 from kmn_jax.viz._viewer_server import start_server, stop_server
 
-OnPick = Callable[[np.ndarray], Detections]
-
 _PICK, _CANCEL = "Pick a point to search at", "Cancel picking"
 _LAYERS = {  # what can be switched: whether it is shown at first, and what it is
     "Scan": (True, "the measured points"),
@@ -50,7 +48,7 @@ class Viewer:
         found: Detections,
         host: str = "127.0.0.1",
         port: int = 8080,
-        on_pick: OnPick | None = None,
+        on_pick: Callable[[np.ndarray], Detections] | None = None,
     ) -> None:
         """Start the server.
 
@@ -65,7 +63,6 @@ class Viewer:
         self._picking = "off"  # then "armed", then "searching"
         self._nodes: list[PoseNodes] = []
         self._list: Any = None
-        self._mark: Any = None
         self._server = start_server(host, port)
         try:
             self._scene = PageScene(self._server, view, self._part)
@@ -100,7 +97,7 @@ class Viewer:
                 self._add_poses()
             self._back.visible = found is not self._first
             if found is self._first:
-                self._unmark()
+                self._scene.mark.visible = False
             self._header.content = self._heading()
             self._switch_layers()
 
@@ -209,8 +206,7 @@ class Viewer:
                 notify("No point there", text, auto_close_seconds=5.0, color="orange")
                 return
             self._server.scene.remove_click_callback(self._clicked)
-            self._unmark()
-            self._mark = self._scene.mark(point)
+            self._scene.show_mark(point)
             place = ", ".join(f"{value:.4g}" for value in point)
             self._set_picking("searching", f"Searching around ({place}) {self.found.unit} ...")
         try:
@@ -223,11 +219,6 @@ class Viewer:
         finally:
             with self._lock:
                 self._set_picking("off")
-
-    def _unmark(self) -> None:
-        if self._mark is not None:
-            self._mark.remove()
-            self._mark = None
 
 
 def _small(content: str) -> str:

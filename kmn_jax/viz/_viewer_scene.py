@@ -77,6 +77,8 @@ class PageScene:
         self._grey = as_bytes(np.repeat(0.25 + 0.6 * shade, 3, axis=1))
         self._by_depth = as_bytes(colors[:, :3] * (0.4 + 0.6 * shade))
         self._scan = self._add_points("/scan", self._points[rows], self._grey)
+        radius = 0.04 * part.diameter / self._size
+        self.mark = self._scene.add_icosphere("/picked", radius=radius, color=(230, 0, 120), visible=False)
 
     def show_scan(self, shown: bool, by_depth: bool) -> None:
         """Show or hide the scan, in the colours of depth or in grey."""
@@ -95,7 +97,7 @@ class PageScene:
             axes_length=0.5 * part.diameter / self._size,
             axes_radius=0.012 * part.diameter / self._size,
             wxyz=SO3.from_matrix(T[:3, :3]).wxyz,
-            position=self._on_page(T[None, :3, 3])[0],
+            position=self._on_page(T[:3, 3]),
         )
         likely = pose.probability >= LIKELY
         _, corners = surface_hexagons(part, int(np.clip(_MOST_HEXAGONS // count, 400, 3000)))
@@ -140,13 +142,12 @@ class PageScene:
         row = nearest_to_ray(self._points, origin, direction)
         if row is None:
             return None
-        return placed(self._view.T_scene_view, self._view.points[row].astype(np.float64)[None])[0]
+        return placed(self._view.T_scene_view, self._view.points[row].astype(np.float64))
 
-    def mark(self, point: Float[np.ndarray, "3"]) -> Any:
-        """Mark a point of the scene's frame; return the node."""
-        place = self._on_page(placed(self._T_view_scene, point[None]))[0]
-        radius = 0.04 * self._part.diameter / self._size
-        return self._scene.add_icosphere("/picked", radius=radius, color=(230, 0, 120), position=place)
+    def show_mark(self, point: Float[np.ndarray, "3"]) -> None:
+        """Mark a point of the scene's frame, in place of the one that was marked before."""
+        self.mark.position = self._on_page(placed(self._T_view_scene, point))
+        self.mark.visible = True
 
     def _add_lights(self) -> None:
         """Light the scene from the sensor's side; the light of a room, which viser has, takes long without a GPU."""
@@ -167,7 +168,7 @@ class PageScene:
             precision="float32",
         )
 
-    def _on_page(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def _on_page(self, points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s 3"]:
         """Return points of the view's frame in the page's."""
         return (points - self._center) / self._size
 
