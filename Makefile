@@ -37,7 +37,8 @@ bench: $(READY) ## whether anything is slower than it was, by ratios
 
 bench-env: $(BENCH_READY) ## add PyTorch, for the benchmarks and the tests marked torch
 
-docs: $(READY) ## run the examples of README.md and docs/
+docs: $(READY) ## build the documentation into site/, and run the examples of README.md and docs/
+	$(BIN)/mkdocs build --strict
 	$(BIN)/python -m pytest tests/test_docs.py
 
 lock: ## compile pyproject.toml into the two locks (LOCK=--upgrade for newer versions)
@@ -48,7 +49,7 @@ lock: ## compile pyproject.toml into the two locks (LOCK=--upgrade for newer ver
 		--no-annotate --python-version 3.11 --python-platform windows - -o requirements-bench.lock
 
 clean: ## remove the environments and caches
-	rm -rf .venv .venv-lock .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
+	rm -rf .venv .venv-lock .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist site
 
 $(READY): requirements.lock pyproject.toml .ci/environment
 	PYTHON="$(PYTHON)" .ci/environment

@@ -32,6 +32,15 @@ GIVEN = {
 }
 
 
+def test_every_room_has_its_page_of_the_reference() -> None:
+    rooms = {path.parent.name for path in (ROOT / "kmn_jax").glob("*/__init__.py")}
+    nav = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    assert {path.stem for path in (ROOT / "docs" / "api").glob("*.md")} == rooms
+    for room in rooms:
+        assert f"::: kmn_jax.{room}\n" in (ROOT / "docs" / "api" / f"{room}.md").read_text(encoding="utf-8")
+        assert f"api/{room}.md\n" in nav
+
+
 @pytest.mark.parametrize(("path", "block"), EXAMPLES)
 def test_example_runs(path: Path, block: re.Match[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     line = path.read_text(encoding="utf-8").count("\n", 0, block.start("code"))

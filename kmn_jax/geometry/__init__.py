@@ -32,14 +32,12 @@ from kmn_jax.geometry._se3 import (
     translation_between,
 )
 from kmn_jax.geometry._smoothing import SmoothConfig, smoothed, towards_camera, with_normals
-from kmn_jax.geometry._subsets import Selection, radius_crop, voxel_thin
 
 __all__ = [
     "Camera",
     "Crop",
     "Intrinsics",
     "PaddedCloud",
-    "Selection",
     "SmoothConfig",
     "compose",
     "crop_around",
@@ -66,7 +64,6 @@ __all__ = [
     "pad_cloud",
     "pose_error",
     "quaternion_to_matrix",
-    "radius_crop",
     "random_pose",
     "random_rotation",
     "rotate_vectors",
@@ -80,6 +77,5 @@ __all__ = [
     "towards_camera",
     "transform_points",
     "translation_between",
-    "voxel_thin",
     "with_normals",
 ]

@@ -2,7 +2,7 @@
 
 from kmn_jax.viz._legend import draw_part
 from kmn_jax.viz._picture import check_picture, save_picture
-from kmn_jax.viz._raster import distinct_colors
+from kmn_jax.viz._shading import distinct_colors
 from kmn_jax.viz._truth import TRUTH_COLORS, truth_codes
 from kmn_jax.viz._viewer import Viewer
 

@@ -12,19 +12,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Int
 
 from kmn_jax.detection import Detection, Detections, Scene, placed
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
 from kmn_jax.geometry import Camera
 from kmn_jax.objects import Part
-from kmn_jax.viz._legend import LIKELY, NOT_THE_PART, center_of, draw_list, draw_part, ranked, summary
-from kmn_jax.viz._raster import Canvas, as_bytes, brightness, distinct_colors, image_places, relief_of, surface_discs
+from kmn_jax.viz._legend import LIKELY, NOT_THE_PART, center_of, draw_list, draw_part, summary
+from kmn_jax.viz._raster import Canvas
+from kmn_jax.viz._shading import (
+    as_bytes,
+    brightness,
+    distinct_colors,
+    image_places,
+    shaded,
+    spacing,
+    surface_hexagons,
+    values_at,
+)
 from kmn_jax.viz._truth import TRUTH_COLORS, truth_codes
 
-RELIEF = 0.03  # of the diameter: noise below that is smoothed before surfaces are shaded
 _CANVAS_SIDE = 800  # pixels of a panel
+_PANEL = 6.4  # inches of its longer side
 _WHOLE, _CLOSEST = 0.8, 0.05  # of the scan's width: what fills more is not zoomed in on, and nothing closer than
 _MOST_CROP_POINTS = 200_000
 _IN_FRONT = 0.05  # of the diameter: what was measured that much nearer hides a pose
@@ -52,87 +62,69 @@ def save_picture(
     """
     check_picture(path)
     try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError:
         raise InputError("pictures need a package that is not installed: pip install 'kmn_jax[plots]'") from None
 
     part = part.in_unit(found.unit)
-    drawing = _Drawing(view, part, found)
-    aspect = float(np.clip(drawing.canvas.width / drawing.canvas.height, 0.6, 2.0))
-    width, height = 6.4 * min(1.0, aspect), 6.4 * min(1.0, 1 / aspect)
+    panels = _Panels(view, part, found)
+    aspect = float(np.clip(panels.canvas.width / panels.canvas.height, 0.6, 2.0))
+    width, height = _PANEL * min(1.0, aspect), _PANEL * min(1.0, 1 / aspect)
     figure = Figure(figsize=(2 * width + 3.8, 2 * height + 1.2), dpi=100, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
     figure.get_layout_engine().set(wspace=0.02, hspace=0.03)
     figure.suptitle(f"{part.name}: {summary(found)}", fontsize=15, parse_math=False)
     grid = figure.add_gridspec(2, 3, width_ratios=(width, width, 3.4))
-    panels = [figure.add_subplot(grid[row, column]) for row in range(2) for column in range(2)]
-    drawing.draw_scan(panels[0], figure)
+    panels.draw_scan(figure.add_subplot(grid[0, 0]))
     if truth is None:
-        drawing.draw_segmentation(panels[1])
+        panels.draw_segmentation(figure.add_subplot(grid[0, 1]))
     else:
-        drawing.draw_truth(panels[1], figure, truth)
-    drawing.draw_keypoints(panels[2])
-    drawing.draw_poses(panels[3])
+        panels.draw_truth(figure.add_subplot(grid[0, 1]), truth)
+    panels.draw_keypoints(figure.add_subplot(grid[1, 0]))
+    panels.draw_poses(figure.add_subplot(grid[1, 1]))
     side = grid[:, 2].subgridspec(3, 1, height_ratios=(1, 1, 2.4))
     draw_part(figure.add_subplot(side[0]), part, (0.5, 0.6, -0.62), "The part's keypoints")
     draw_part(figure.add_subplot(side[1]), part, (-0.5, -0.6, 0.62), "from behind")
     draw_list(figure.add_subplot(side[2]), found)
     content = io.BytesIO()
-    canvas.print_png(content)
+    figure.savefig(content, format="png")
     write_whole(path, content.getvalue())
 
 
-class _Drawing:
-    """What the panels share: the scan's shading, the crops' points, and the raster they are drawn on."""
+class _Panels:
+    """What the panels share: the shaded scan, all crops' points, and the part of the image that is shown."""
 
     def __init__(self, view: Scene, part: Part, found: Detections) -> None:
         self.view, self.part, self.found = view, part, found
         self.T_view_scene = np.linalg.inv(view.T_scene_camera)
-        self.pose_colors = distinct_colors(max(1, len(found.poses)))
-        self.surface = surface_discs(part.points, part.normals)
-        self.step, self.depth, self.shade = relief_of(view.depth, view.camera, RELIEF * part.diameter)
+        self.pose_colors = distinct_colors(len(found.poses))
+        self.surface = surface_hexagons(part)
+        self.scan = shaded(view.depth, view.camera, part.diameter)
+        crops = [pose.prediction for pose in found.poses]
+        self.crop_of = np.repeat(np.arange(len(crops)), [len(crop.points) for crop in crops])
+        self.on_object = np.concatenate([np.zeros(0, dtype=bool), *(crop.on_object for crop in crops)])
+        self.keypoint = np.concatenate([np.zeros(0, dtype=int), *(crop.keypoint for crop in crops)])
+        self.points = self._in_view(np.concatenate([np.zeros((0, 3)), *(crop.points for crop in crops)]))
+        copies = [self._in_view(placed(pose.T_scene_object, part.points)) for pose in found.poses]
+        self.grey = 0.55 + 0.38 * self.scan.brightness[..., None]
         self.box = _measured_box(view)
-        self.canvas = _zoomed(view.camera, self.box, self._places())
-        self.dot = self._dot()
+        self.canvas = _zoomed(view.camera, self.box, image_places(view.camera, np.concatenate([self.points, *copies])))
 
-    def _places(self) -> Float[np.ndarray, "n 2"]:
-        """Return where the image has the crops and the corners of the poses."""
-        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-        corners = self.part.minimum + corners * (self.part.maximum - self.part.minimum)
-        clouds = [self._in_view(placed(pose.T_scene_object, corners)) for pose in self.found.poses]
-        clouds += [self._in_view(pose.prediction.points) for pose in self.found.poses]
-        return image_places(self.view.camera, np.concatenate(clouds)) if clouds else np.zeros((0, 2))
-
-    def _dot(self) -> int:
-        """Return the size of a crop's points in pixels, so that they nearly cover what they stand for."""
-        from scipy.spatial import cKDTree
-
-        apart = []
-        for pose in self.found.poses[:5]:
-            places = image_places(self.view.camera, self._in_view(pose.prediction.points))
-            if len(places) > 1:
-                apart.append(float(np.median(cKDTree(places).query(places, k=2)[0][:, 1])))
-        return int(np.clip(round(1.6 * self.canvas.scale * float(np.median(apart))), 3, 12)) if apart else 3
-
-    def _in_view(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def _in_view(self, points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s 3"]:
         return placed(self.T_view_scene, points.astype(np.float64))
 
-    def draw_scan(self, axis: Any, figure: Any) -> None:
+    def draw_scan(self, axis: Any) -> None:
         from matplotlib import colormaps
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import Normalize
         from matplotlib.patches import Rectangle
 
+        measured = self.scan.depth[self.scan.depth > 0]
+        norm = Normalize(*np.percentile(measured if measured.size else [0.0, 1.0], [0.5, 99.5]))
+        cmap = colormaps["viridis_r"]
+        self._draw_scan(axis, cmap(norm(self.scan.depth))[..., :3] * (0.5 + 0.5 * self.scan.brightness[..., None]))
         left, right, bottom, top = self.box
-        measured = self.depth[self.depth > 0]
-        low, high = (float(x) for x in np.percentile(measured, [0.5, 99.5])) if measured.size else (0.0, 1.0)
-        norm, cmap = Normalize(low, max(high, low + 1e-9 * (1 + abs(low)))), colormaps["viridis_r"]
-        colors = cmap(norm(self.depth))[..., :3] * (0.5 + 0.5 * self.shade[..., None])
-        self._backdrop(axis, colors)
-        axis.set_xlim(left, right)
-        axis.set_ylim(bottom, top)
-        bar = figure.colorbar(ScalarMappable(norm, cmap), ax=axis, fraction=0.03, pad=0.01)
+        axis.set(xlim=(left, right), ylim=(bottom, top))
+        bar = axis.figure.colorbar(ScalarMappable(norm, cmap), ax=axis, fraction=0.03, pad=0.01)
         bar.ax.invert_yaxis()  # near is above, as bright as in the panel
         title = f"Scan: depth in {self.found.unit}"
         left, right, bottom, top = self.canvas.extent
@@ -142,64 +134,49 @@ class _Drawing:
         axis.set_title(title)
 
     def draw_segmentation(self, axis: Any) -> None:
-        self._backdrop(axis)
-        crops = [(pose.prediction.points, pose.prediction.on_object) for pose in self.found.poses]
-        colors = [
-            np.where(on[:, None], color, NOT_THE_PART) for (_, on), color in zip(crops, self.pose_colors, strict=False)
-        ]
-        self._points(axis, [points for points, _ in crops], colors, [on.astype(int) for _, on in crops])
-        share = sum(int(on.sum()) for _, on in crops) / max(1, sum(len(on) for _, on in crops))
+        self._draw_scan(axis, self.grey)
+        colors = np.where(self.on_object[:, None], self.pose_colors[self.crop_of], NOT_THE_PART)
+        self._draw_points(axis, colors, self.on_object)
+        share = self.on_object.sum() / max(1, len(self.on_object))
         axis.set_title(f"Segmentation: {share:.0%} of the crops' points are on a copy (coloured)")
 
-    def draw_truth(self, axis: Any, figure: Any, truth: Sequence[Float[np.ndarray, "4 4"]]) -> None:
+    def draw_truth(self, axis: Any, truth: Sequence[Float[np.ndarray, "4 4"]]) -> None:
         from matplotlib.patches import Patch
 
-        self._backdrop(axis, dark=True)
-        poses = self.found.poses
-        codes = [truth_codes(self.part, pose, truth) for pose in poses]
-        table = np.array(list(TRUTH_COLORS.values()))
+        self._draw_scan(axis, 0.18 + 0.37 * self.scan.brightness[..., None], background=0.10)
+        codes = [truth_codes(self.part, pose, truth) for pose in self.found.poses]
+        code = np.concatenate([np.zeros(0, dtype=int), *codes])
         # Where crops overlap, faults are shown rather than what is right.
-        order = np.array([0, 4, 3, 2, 1])
-        self._points(
-            axis, [pose.prediction.points for pose in poses], [table[code] for code in codes], [order[c] for c in codes]
-        )
-        counts = np.bincount(np.concatenate(codes), minlength=5) if codes else np.zeros(5, dtype=int)
-        shares = counts / max(1, counts.sum())
+        self._draw_points(axis, np.array(list(TRUTH_COLORS.values()))[code], np.array([0, 4, 3, 2, 1])[code])
+        shares = np.bincount(code, minlength=5) / max(1, len(code))
         patches = [
             Patch(facecolor=color, edgecolor="black", lw=0.5, label=f"{share:4.0%} {name}")
             for (name, color), share in zip(TRUTH_COLORS.items(), shares, strict=True)
         ]
-        figure.legend(handles=patches, loc="outside lower center", ncols=len(patches), fontsize=10, frameon=False)
+        axis.figure.legend(handles=patches, loc="outside lower center", ncols=5, fontsize=10, frameon=False)
         axis.set_title("Points of the crops against the truth")
 
     def draw_keypoints(self, axis: Any) -> None:
-        self._backdrop(axis)
-        table = distinct_colors(self.part.num_keypoints)
-        chosen = [pose.prediction for pose in self.found.poses]
-        self._points(
-            axis,
-            [prediction.points[prediction.on_object] for prediction in chosen],
-            [table[prediction.keypoint[prediction.on_object]] for prediction in chosen],
-            [np.zeros(int(prediction.on_object.sum()), dtype=int) for prediction in chosen],
-        )
+        self._draw_scan(axis, self.grey)
+        colors = distinct_colors(self.part.num_keypoints)[self.keypoint]
+        self._draw_points(axis, colors, np.where(self.on_object, 0, -1))
         axis.set_title("Likeliest keypoint of points on a copy")
 
     def draw_poses(self, axis: Any) -> None:
         import matplotlib.patheffects as effects
 
-        self._backdrop(axis)
-        canvas = self.canvas
-        image = np.zeros((canvas.height, canvas.width, 4))
+        self._draw_scan(axis, self.grey)
+        image = np.zeros((self.canvas.height, self.canvas.width, 4))
         nearest = np.full(image.shape[:2], np.inf)
-        measured = canvas.measured(self.view.depth)
+        ranked = enumerate(zip(self.found.poses, self.pose_colors, strict=True), start=1)
         # Likely poses come last: they are in front of all others, whatever their depth.
-        for rank, pose in sorted(ranked(self.found), key=lambda row: row[1].probability >= LIKELY):
-            self._paint(pose, self.pose_colors[rank - 1], image, nearest, measured)
+        for rank, (pose, color) in sorted(ranked, key=lambda row: row[1][0].probability >= LIKELY):
             likely = pose.probability >= LIKELY
-            center = self._in_view(placed(pose.T_scene_object, center_of(self.part)[None]))
+            self._paint(pose, color, image, nearest)
+            center = self._in_view(placed(pose.T_scene_object, center_of(self.part)))
             axis.annotate(
                 f"{rank}: {pose.probability:.2f}",
-                image_places(canvas.camera, center)[0],
+                image_places(self.canvas.camera, center),
                 ha="center",
                 va="center",
                 fontsize=10 if likely else 8.5,
@@ -208,11 +185,10 @@ class _Drawing:
                 path_effects=[effects.withStroke(linewidth=2.5, foreground="white")],
                 annotation_clip=True,
             )
-        axis.imshow(as_bytes(image), extent=canvas.extent, interpolation="nearest")
-        self._limits(axis)
+        axis.imshow(as_bytes(image), extent=self.canvas.extent, interpolation="nearest")
         axis.set_title(f"Poses with rank and probability; dashed below {LIKELY}")
         if not self.found.poses:
-            self._say(axis)
+            self._tell_why_not(axis)
 
     def _paint(
         self,
@@ -220,79 +196,63 @@ class _Drawing:
         color: Float[np.ndarray, "3"],
         image: Float[np.ndarray, "h w 4"],
         nearest: Float[np.ndarray, "h w"],
-        measured: Float32[np.ndarray, "h w"],
     ) -> None:
         """Paint a pose into an image, paler where the scan has something in front of it."""
+        from scipy.ndimage import binary_erosion
+
         T_view_object = self.T_view_scene @ pose.T_scene_object
-        points, normals, radii = self.surface
+        normals, corners = self.surface
         normals = normals @ T_view_object[:3, :3].T
-        index, depth = self.canvas.seen_discs(placed(T_view_object, points), normals, radii)
-        rows, columns = np.flatnonzero((index >= 0).any(axis=1)), np.flatnonzero((index >= 0).any(axis=0))
-        if not len(rows):
-            return
-        window = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        index, depth, nearest, image = index[window], depth[window], nearest[window], image[window]
-        shown = (index >= 0) & (depth < nearest)
-        hidden = (measured[window] > 0) & (measured[window] < depth - _IN_FRONT * self.part.diameter)
-        edge = shown & ~_eroded(shown)
-        likely = pose.probability >= LIKELY
-        if likely:
-            nearest[shown] = depth[shown]
-            edge = shown & ~_eroded(_eroded(shown))
+        corners = placed(T_view_object, corners)
+        centers = corners.mean(axis=1)
+        depth = centers[:, 2]
+        index = self.canvas.seen(normals, corners)
+        shown = (index >= 0) & (depth[index] < nearest)
+        measured = values_at(self.view.depth, image_places(self.view.camera, centers))
+        hidden = (measured > 0) & (measured < depth - _IN_FRONT * self.part.diameter)
+        if pose.probability >= LIKELY:
+            nearest[shown] = depth[index[shown]]
+            outline = shown & ~binary_erosion(shown, iterations=2)
             opacity = np.where(hidden, 0.35, 0.85)
         else:
-            edge &= np.add.outer(np.arange(len(edge)), np.arange(len(edge[0]))) // _DASH % 2 == 0
+            dashes = np.add.outer(np.arange(len(image)), np.arange(len(image[0]))) // _DASH % 2 == 0
+            outline = shown & ~binary_erosion(shown) & dashes
             opacity = np.where(hidden, 0.08, 0.2)
-        image[shown, :3] = color * (0.3 + 0.7 * brightness(normals))[index[shown], None]
-        image[shown, 3] = opacity[shown]
-        image[edge] = (*(0.75 * color), 1.0)
+        colors = np.column_stack([color * (0.3 + 0.7 * brightness(normals))[:, None], opacity])
+        image[shown] = colors[index[shown]]
+        image[outline] = (*(0.75 * color), 1.0)
 
-    def _points(self, axis: Any, clouds: list[Any], colors: list[Any], ranks: list[Any]) -> None:
-        """Draw points of crops; where they overlap, those of the highest rank."""
-        if not clouds:
-            self._say(axis)
+    def _draw_points(
+        self, axis: Any, colors: Float[np.ndarray, "n 3"], rank: Int[np.ndarray, " n"] | Bool[np.ndarray, " n"]
+    ) -> None:
+        """Draw the crops' points; where they overlap those of the highest rank, and of a negative one none."""
+        if not self.found.poses:
+            self._tell_why_not(axis)
             return
-        points, color, rank = np.concatenate(clouds), np.concatenate(colors), np.concatenate(ranks)
-        if len(points) > _MOST_CROP_POINTS:
-            kept = np.random.default_rng(0).choice(len(points), _MOST_CROP_POINTS, replace=False)
-            points, color, rank = points[kept], color[kept], rank[kept]
-        canvas = self.canvas
-        image = np.zeros((canvas.height, canvas.width, 4))
-        for level in np.unique(rank):
-            index, _ = canvas.seen(self._in_view(points[rank == level]), self.dot)
-            image[index >= 0, :3] = color[rank == level][index[index >= 0]]
-            image[index >= 0, 3] = 1
-        axis.imshow(as_bytes(image), extent=canvas.extent, interpolation="nearest")
-        self._limits(axis)
+        rows = np.random.default_rng(0).permutation(len(rank))[:_MOST_CROP_POINTS]
+        rows = rows[(rank[rows] >= 0) & (self.points[rows, 2] > 0)]
+        rows = rows[np.lexsort([-self.points[rows, 2], rank[rows]])]
+        places = image_places(self.view.camera, self.points)
+        # So large that they nearly cover what they stand for.
+        pixels = np.clip(1.6 * self.canvas.scale * spacing(places[self.crop_of == 0]), 3, 12)
+        points = pixels / _CANVAS_SIDE * _PANEL * 72
+        axis.scatter(*places[rows].T, s=points**2, c=colors[rows], marker="s", lw=0)
 
-    def _backdrop(self, axis: Any, colors: Float[np.ndarray, "h w 3"] | None = None, dark: bool = False) -> None:
-        if colors is None:
-            low, high = (0.18, 0.55) if dark else (0.55, 0.93)
-            colors = np.repeat((low + (high - low) * self.shade)[..., None], 3, axis=2)
-        colors = np.where(np.isnan(colors), 0.10 if dark else 0.98, colors)
-        height, width = self.shade.shape
-        extent = (-0.5, width * self.step - 0.5, height * self.step - 0.5, -0.5)
+    def _draw_scan(self, axis: Any, colors: Float[np.ndarray, "h w c"], background: float = 0.98) -> None:
+        """Draw the scan in colours, of one channel or three, that are NaN where nothing was measured."""
+        height, width = self.scan.brightness.shape
+        colors = np.broadcast_to(np.where(np.isnan(colors), background, colors), (height, width, 3))
+        extent = (-0.5, width * self.scan.step - 0.5, height * self.scan.step - 0.5, -0.5)
         axis.imshow(as_bytes(colors), extent=extent, interpolation="nearest")
-        axis.set_facecolor("0.10" if dark else "0.98")
-        axis.set(xticks=[], yticks=[])
-        self._limits(axis)
-
-    def _limits(self, axis: Any) -> None:
         left, right, bottom, top = self.canvas.extent
-        axis.set_xlim(left, right)
-        axis.set_ylim(bottom, top)
+        axis.set(xlim=(left, right), ylim=(bottom, top), xticks=[], yticks=[], facecolor=str(background))
 
-    def _say(self, axis: Any) -> None:
+    def _tell_why_not(self, axis: Any) -> None:
         text = textwrap.fill(self.found.reason or "no pose was found", 40)
         box = {"facecolor": "white", "edgecolor": "0.4", "boxstyle": "round,pad=0.6"}
         axis.text(
             0.5, 0.5, text, ha="center", va="center", transform=axis.transAxes, fontsize=12, bbox=box, parse_math=False
         )
-
-
-def _eroded(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    padded = np.pad(mask, 1)
-    return mask & padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
 
 
 def _measured_box(view: Scene) -> tuple[float, float, float, float]:

@@ -17,6 +17,7 @@ TRUTH_COLORS = {
     "part, but keypoint wrong": (0.15, 0.30, 0.95),
     "part, and keypoint right": (0.10, 0.70, 0.20),
 }
+"""Colours in [0, 1] by what a point of a crop is and was taken for; `truth_codes` returns rows of it."""
 BACKGROUND, FALSE_PART, MISSED, WRONG_KEYPOINT, RIGHT = range(5)  # the rows of TRUTH_COLORS
 _ON_SURFACE = 0.02  # of the diameter: points nearer than that to a copy lie on it
 _DISC = 0.6  # radius of what a surface point stands for, of the square root of its share of the area

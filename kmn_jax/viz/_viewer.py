@@ -1,4 +1,4 @@
-"""A page of estimates in the browser: the scan, the poses, what the network said, and a search at a picked point.
+"""A page of estimates in the browser: the scan, the poses, what the network predicted, and a search at a picked point.
 
 The page comes from a server on this machine and fetches nothing else.
 """
@@ -9,7 +9,6 @@ import contextlib
 import html
 import threading
 from collections.abc import Callable
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -18,12 +17,10 @@ from jaxtyping import Float
 from kmn_jax.detection import Detection, Detections, Scene
 from kmn_jax.errors import InputError
 from kmn_jax.objects import Part
-from kmn_jax.viz._legend import LIKELY, ranked, summary
-from kmn_jax.viz._raster import as_bytes, distinct_colors
+from kmn_jax.viz._legend import LIKELY, summary
+from kmn_jax.viz._shading import as_bytes, distinct_colors
 from kmn_jax.viz._viewer_scene import PageScene, PoseNodes
 from kmn_jax.viz._viewer_server import start_server, stop_server
-
-OnPick = Callable[[np.ndarray], Detections]
 
 _PICK, _CANCEL = "Pick a point to search at", "Cancel picking"
 _LAYERS = {  # what can be switched: whether it is shown at first, and what it is
@@ -51,21 +48,21 @@ class Viewer:
         found: Detections,
         host: str = "127.0.0.1",
         port: int = 8080,
-        on_pick: OnPick | None = None,
+        on_pick: Callable[[np.ndarray], Detections] | None = None,
     ) -> None:
         """Start the server.
 
         Port 0 takes any that is free. Raises InputError if the port is in use, the host is not this machine's, or
         viser is not installed.
         """
-        self._part, self._first, self._found, self._on_pick = part.in_unit(found.unit), found, found, on_pick
+        self._part, self._first, self._on_pick = part.in_unit(found.unit), found, on_pick
+        self.found = found  # what is shown
         self._num_points = len(view.points)
         self._lock = threading.RLock()  # of all that follows: callbacks come from several threads
         self._stopped = threading.Event()
         self._picking = "off"  # then "armed", then "searching"
         self._nodes: list[PoseNodes] = []
         self._list: Any = None
-        self._mark: Any = None
         self._server = start_server(host, port)
         try:
             self._scene = PageScene(self._server, view, self._part)
@@ -82,11 +79,6 @@ class Viewer:
         host = "localhost" if host in ("", "0.0.0.0", "::") else f"[{host}]" if ":" in host else host
         return f"http://{host}:{self._server.get_port()}"
 
-    @property
-    def found(self) -> Detections:
-        """What is shown."""
-        return self._found
-
     def is_shown(self, rank: int, layer: str | None = None) -> bool:
         """Tell whether the pose of a rank, from 1 on, is switched on; with a layer, whether that is too."""
         nodes = self._nodes[rank - 1]
@@ -99,18 +91,13 @@ class Viewer:
                 nodes.frame.remove()
             if self._list is not None:
                 self._list.remove()
-            self._found = found
-            colors = distinct_colors(max(1, len(found.poses)))
-            self._nodes = [
-                self._scene.add_pose(rank, pose, color, len(found.poses))
-                for (rank, pose), color in zip(ranked(found), colors, strict=False)
-            ]
+            self.found = found
             self._list = self._server.gui.add_folder("Poses", visible=bool(found.poses))
             with self._list:
-                self._add_switches(found, colors)
+                self._add_poses()
             self._back.visible = found is not self._first
             if found is self._first:
-                self._unmark()
+                self._scene.mark.visible = False
             self._header.content = self._heading()
             self._switch_layers()
 
@@ -129,9 +116,7 @@ class Viewer:
         """Return itself."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Stop the server."""
         self.stop()
 
@@ -152,23 +137,25 @@ class Viewer:
                 self._layers[name] = gui.add_checkbox(name, shown, hint=hint)
                 self._layers[name].on_update(lambda _: self._switch_layers())
 
-    def _add_switches(self, found: Detections, colors: Float[np.ndarray, "n 3"]) -> None:
-        """Add a switch and a line of facts for every pose, and buttons that switch several."""
-        gui = self._server.gui
-        choice = gui.add_button_group("Switch on", ("all", "likely", "none"), visible=len(found.poses) > 1)
-        switches = []
-        for (rank, pose), color, nodes in zip(ranked(found), colors, self._nodes, strict=False):
-            switch = gui.add_checkbox(f"Pose {rank}", True, hint=_details(pose, found.unit))
+    def _add_poses(self) -> None:
+        """Add every pose to the scene, a switch and a line of facts for each, and buttons that switch several."""
+        gui, poses = self._server.gui, self.found.poses
+        choice = gui.add_button_group("Switch on", ("all", "likely", "none"), visible=len(poses) > 1)
+        self._nodes, switches = [], []
+        for rank, (pose, color) in enumerate(zip(poses, distinct_colors(len(poses)), strict=True), start=1):
+            nodes = self._scene.add_pose(rank, pose, color, len(poses))
+            switch = gui.add_checkbox(f"Pose {rank}", True, hint=_details(pose, self.found.unit))
             gui.add_html(_facts(pose, color))
 
             def update(_: Any, nodes: PoseNodes = nodes, switch: Any = switch) -> None:
                 nodes.frame.visible = switch.value
 
             switch.on_update(update)
+            self._nodes.append(nodes)
             switches.append(switch)
 
         def choose(_: Any) -> None:
-            for switch, pose in zip(switches, found.poses, strict=True):
+            for switch, pose in zip(switches, poses, strict=True):
                 switch.value = choice.value == "all" or (choice.value == "likely" and pose.probability >= LIKELY)
 
         choice.on_click(choose)
@@ -184,7 +171,7 @@ class Viewer:
                     layer.visible = on[name]
 
     def _heading(self, doing: str = "") -> str:
-        found = self._found
+        found = self.found
         facts = f"scan of {self._num_points:,} points, searched in {found.timing.total:.2f} s"
         lines = [f"<b>{html.escape(summary(found))}</b>", facts]
         lines += [_warning(text) for text in found.warnings]
@@ -219,10 +206,9 @@ class Viewer:
                 notify("No point there", text, auto_close_seconds=5.0, color="orange")
                 return
             self._server.scene.remove_click_callback(self._clicked)
-            self._unmark()
-            self._mark = self._scene.mark(point)
+            self._scene.show_mark(point)
             place = ", ".join(f"{value:.4g}" for value in point)
-            self._set_picking("searching", f"Searching around ({place}) {self._found.unit} ...")
+            self._set_picking("searching", f"Searching around ({place}) {self.found.unit} ...")
         try:
             self.show(self._on_pick(point))
         except InputError as error:
@@ -233,11 +219,6 @@ class Viewer:
         finally:
             with self._lock:
                 self._set_picking("off")
-
-    def _unmark(self) -> None:
-        if self._mark is not None:
-            self._mark.remove()
-            self._mark = None
 
 
 def _small(content: str) -> str:
@@ -252,8 +233,7 @@ def _facts(pose: Detection, color: Float[np.ndarray, "3"]) -> str:
     red, green, blue = as_bytes(color)
     swatch = f'<span style="color: rgb({red}, {green}, {blue})">&#9632;</span>'
     numbers = f"probability {pose.probability:.2f}, {pose.visible_fraction:.0%} visible, {pose.num_inliers} inliers"
-    lines = [f"{swatch} {numbers}"]
-    return _small("<br>".join(lines + [_warning(text) for text in pose.warnings]))
+    return _small("<br>".join([f"{swatch} {numbers}", *(_warning(text) for text in pose.warnings)]))
 
 
 def _details(pose: Detection, unit: str) -> str:

@@ -10,17 +10,24 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8, UInt32
+from jaxtyping import Float, UInt8
 
 from kmn_jax.detection import Detection, Scene, into, placed
 from kmn_jax.objects import Part
 from kmn_jax.viz._legend import LIKELY, NOT_THE_PART, center_of
-from kmn_jax.viz._picture import RELIEF
-from kmn_jax.viz._raster import as_bytes, depth_colors, distinct_colors, image_places, relief_of, surface_discs
+from kmn_jax.viz._shading import (
+    as_bytes,
+    distinct_colors,
+    image_places,
+    shaded,
+    spacing,
+    surface_hexagons,
+    values_at,
+)
 
 _FIELD_OF_VIEW = np.radians(40)
 _MOST_SCAN_POINTS = 300_000  # that are sent
-_MOST_DISCS = 60_000  # of all poses' surfaces
+_MOST_HEXAGONS = 60_000  # of all poses' surfaces
 _REACH = np.radians(1.5)  # from a click, in which the nearest point of the scan has to be
 _SAME_RAY = np.radians(0.3)  # points so near to the clicked ray hide each other
 # Of the diameter: so much nearer to the sensor are surfaces and points of crops drawn, to be seen before the scan.
@@ -41,6 +48,9 @@ class PageScene:
 
     def __init__(self, server: Any, view: Scene, part: Part) -> None:
         """Add the scan, and set the camera on the sensor's side, as near as the scan fills the page."""
+        from matplotlib import colormaps
+        from matplotlib.colors import Normalize
+
         self._scene, self._view, self._part = server.scene, view, part
         self._T_view_scene = np.linalg.inv(view.T_scene_camera)
         low, high = np.percentile(view.points, [1, 99], axis=0).astype(np.float64)
@@ -58,11 +68,17 @@ class PageScene:
         rows = np.arange(len(view.points))
         if len(rows) > _MOST_SCAN_POINTS:
             rows = np.random.default_rng(0).choice(rows, _MOST_SCAN_POINTS, replace=False)
-        shade = self._shade(view.points[rows])[:, None]
-        self._dot = 1.3 * _spacing(self._points[rows])
+        points = view.points[rows]
+        scan = shaded(view.depth, view.camera, part.diameter)
+        brightness = values_at(scan.brightness, image_places(view.camera, points) / scan.step)
+        shade = np.where(np.isnan(brightness), 0.7, brightness)[:, None]
+        colors = colormaps["viridis_r"](Normalize(*np.percentile(points[:, 2], [0.5, 99.5]))(points[:, 2]))
+        self._dot = float(np.clip(1.3 * spacing(self._points[rows]), 6.5e-4, 0.065))
         self._grey = as_bytes(np.repeat(0.25 + 0.6 * shade, 3, axis=1))
-        self._by_depth = as_bytes(depth_colors(view.points[rows, 2]) * (0.4 + 0.6 * shade))
+        self._by_depth = as_bytes(colors[:, :3] * (0.4 + 0.6 * shade))
         self._scan = self._add_points("/scan", self._points[rows], self._grey)
+        radius = 0.04 * part.diameter / self._size
+        self.mark = self._scene.add_icosphere("/picked", radius=radius, color=(230, 0, 120), visible=False)
 
     def show_scan(self, shown: bool, by_depth: bool) -> None:
         """Show or hide the scan, in the colours of depth or in grey."""
@@ -81,15 +97,15 @@ class PageScene:
             axes_length=0.5 * part.diameter / self._size,
             axes_radius=0.012 * part.diameter / self._size,
             wxyz=SO3.from_matrix(T[:3, :3]).wxyz,
-            position=self._on_page(T[None, :3, 3])[0],
+            position=self._on_page(T[:3, 3]),
         )
         likely = pose.probability >= LIKELY
-        most = int(np.clip(_MOST_DISCS // count, 400, 3000))
-        vertices, faces = _hexagons(*surface_discs(part.points, part.normals, most))
+        _, corners = surface_hexagons(part, int(np.clip(_MOST_HEXAGONS // count, 400, 3000)))
+        fan = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
         surface = scene.add_mesh_simple(
             f"{name}/surface",
-            (vertices / self._size).astype(np.float32),
-            faces,
+            (corners.reshape(-1, 3) / self._size).astype(np.float32),
+            (6 * np.arange(len(corners))[:, None, None] + fan).reshape(-1, 3).astype(np.uint32),
             color=tuple(int(value) for value in as_bytes(color if likely else _PALE + (1 - _PALE) * color)),
             position=-_SURFACE_LIFT * part.diameter / self._size * _unit(T[:3, 3]) @ T[:3, :3],
             side="double",
@@ -126,13 +142,12 @@ class PageScene:
         row = nearest_to_ray(self._points, origin, direction)
         if row is None:
             return None
-        return placed(self._view.T_scene_camera, self._view.points[row].astype(np.float64)[None])[0]
+        return placed(self._view.T_scene_camera, self._view.points[row].astype(np.float64))
 
-    def mark(self, point: Float[np.ndarray, "3"]) -> Any:
-        """Mark a point of the scene's frame; return the node."""
-        place = self._on_page(placed(self._T_view_scene, point[None]))[0]
-        radius = 0.04 * self._part.diameter / self._size
-        return self._scene.add_icosphere("/picked", radius=radius, color=(230, 0, 120), position=place)
+    def show_mark(self, point: Float[np.ndarray, "3"]) -> None:
+        """Mark a point of the scene's frame, in place of the one that was marked before."""
+        self.mark.position = self._on_page(placed(self._T_view_scene, point))
+        self.mark.visible = True
 
     def _add_lights(self) -> None:
         """Light the scene from the sensor's side; the light of a room, which viser has, takes long without a GPU."""
@@ -141,13 +156,6 @@ class PageScene:
         self._scene.add_light_ambient("/lights/ambient", intensity=1.2)
         for name, position, intensity in (("front", (-0.4, -0.5, -0.8), 2.4), ("back", (0.4, 0.5, 0.8), 1.0)):
             self._scene.add_light_directional(f"/lights/{name}", position=position, intensity=intensity)
-
-    def _shade(self, points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Return how bright points of the scan are: as the depth image is where it has them."""
-        step, depth, shades = relief_of(self._view.depth, self._view.camera, RELIEF * self._part.diameter)
-        column, row = np.round(image_places(self._view.camera, points) / step).astype(int).T
-        shade = shades[row.clip(0, depth.shape[0] - 1), column.clip(0, depth.shape[1] - 1)]
-        return np.where(np.isnan(shade), 0.7, shade).astype(np.float64)
 
     def _add_points(self, name: str, places: Float[np.ndarray, "n 3"], colors: UInt8[np.ndarray, "n 3"]) -> Any:
         return self._scene.add_point_cloud(
@@ -160,7 +168,7 @@ class PageScene:
             precision="float32",
         )
 
-    def _on_page(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def _on_page(self, points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s 3"]:
         """Return points of the view's frame in the page's."""
         return (points - self._center) / self._size
 
@@ -181,30 +189,3 @@ def nearest_to_ray(
 
 def _unit(vectors: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s 3"]:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
-
-
-def _spacing(points: Float[np.ndarray, "n 3"]) -> float:
-    """Return how far points typically are from their nearest ones."""
-    from scipy.spatial import cKDTree
-
-    if len(points) < 2:
-        return 0.01
-    chosen = np.random.default_rng(0).permutation(len(points))[:2000]
-    apart = cKDTree(points).query(points[chosen], k=2)[0][:, 1]
-    return float(np.clip(np.percentile(apart, 75), 5e-4, 0.05))
-
-
-def _hexagons(
-    centers: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, " n"]
-) -> tuple[Float32[np.ndarray, "v 3"], UInt32[np.ndarray, "f 3"]]:
-    """Return the triangles of hexagons in place of discs, wound about their normals."""
-    helper = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
-    first = np.cross(normals, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(normals, first)
-    turns = np.radians(np.arange(0, 360, 60))
-    rims = np.cos(turns)[:, None] * first[:, None] + np.sin(turns)[:, None] * second[:, None]
-    vertices = (centers[:, None] + 1.1 * radii[:, None, None] * rims).reshape(-1, 3)
-    fan = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
-    faces = (6 * np.arange(len(centers))[:, None, None] + fan).reshape(-1, 3)
-    return vertices.astype(np.float32), faces.astype(np.uint32)

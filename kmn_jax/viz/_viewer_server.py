@@ -13,7 +13,16 @@ from kmn_jax.errors import InputError
 
 def start_server(host: str, port: int) -> Any:
     """Return a running server; it would take another port by itself if this one is in use."""
-    _check_free(host, port)
+    if not 0 <= port <= 65535:
+        raise InputError(f"port {port} is not one: choose 1 to 65535, or 0 for any that is free")
+    try:
+        family, *_, address = socket.getaddrinfo(host or None, port, flags=socket.AI_PASSIVE)[0]
+        socket.create_server(address[:2], family=family).close()
+    except (socket.gaierror, UnicodeError):
+        raise InputError(f"host {host!r} is not known: 127.0.0.1 shows the page on this machine only") from None
+    except OSError as error:
+        why = os.strerror(error.errno or 0)
+        raise InputError(f"port {port} of {host} cannot be used ({why}): choose another one, or 0 for any") from None
     try:
         import viser
     except ImportError:
@@ -23,28 +32,9 @@ def start_server(host: str, port: int) -> Any:
     # The page could ask for a public address by a server elsewhere; scans stay here.
     server.request_share_url = lambda verbose=True: None
     if port not in (0, server.get_port()):
-        server.stop()
+        stop_server(server)
         raise InputError(f"port {port} has just come into use: choose another one, or 0 for any that is free")
     return server
-
-
-def _check_free(host: str, port: int) -> None:
-    if not 0 <= port <= 65535:
-        raise InputError(f"port {port} is not one: choose 1 to 65535, or 0 for any that is free")
-    try:
-        places = socket.getaddrinfo(host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-    except (OSError, UnicodeError):
-        raise InputError(f"host {host!r} is not known: 127.0.0.1 shows the page on this machine only") from None
-    for family, kind, protocol, _, address in places:
-        with socket.socket(family, kind, protocol) as trial:
-            if os.name == "posix":
-                trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                trial.bind(address)
-            except OSError as error:
-                raise InputError(
-                    f"port {port} of {host} cannot be used ({error.strerror}): choose another one, or 0 for any free"
-                ) from None
 
 
 def stop_server(server: Any) -> None:

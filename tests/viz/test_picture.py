@@ -217,19 +217,23 @@ def test_units_of_part_and_scene_may_differ(part: Part, view: View, found: Detec
     assert (one != other).any(axis=2).mean() < 1e-3  # but for rounding
 
 
-def test_discs_are_seen_where_rays_meet_them() -> None:
-    canvas = Canvas(CAMERA, -0.5, -0.5, 1.0, CAMERA.width, CAMERA.height)
-    centers = np.array([[0.0, 0.0, 2.0], [0.1, 0.0, 3.0], [0.0, 0.0, 1.0]])
+def test_hexagons_are_seen_where_rays_meet_them() -> None:
+    canvas = Canvas(CAMERA, -0.5, -0.5, 4.0, 4 * CAMERA.width, 4 * CAMERA.height)
     tilted = np.array([0.0, -0.6, -0.8])
     normals = np.stack([tilted, [0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])  # the last one faces away
-    index, depth = canvas.seen_discs(centers, normals, np.array([0.2, 0.9, 0.9]))
+    centers, radii = np.array([[0.0, 0.0, 2.0], [0.1, 0.0, 3.0], [0.0, 0.0, 1.0]]), np.array([0.2, 0.7, 0.7])
+    turns = np.radians(np.arange(0, 360, 60))[:, None]
+    across = np.cross(normals, [1.0, 0.0, 0.0])[:, None]
+    rims = np.cos(turns) * [1.0, 0.0, 0.0] + np.sin(turns) * across
+    index = canvas.seen(normals, centers[:, None] + radii[:, None, None] * rims)
     rows, columns = np.nonzero(index == 0)
-    rays = np.stack([(columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy, np.ones(len(rows))], axis=1)
-    points = rays * depth[rows, columns][:, None]
-    np.testing.assert_allclose((points - centers[0]) @ tilted, 0, atol=1e-9)
-    assert np.linalg.norm(points - centers[0], axis=1).max() <= 0.2
-    np.testing.assert_allclose(len(rows), np.pi * 0.2**2 * 0.8 * (CAMERA.fx / 2) ** 2, rtol=0.05)
-    np.testing.assert_allclose((index >= 0).sum(), np.pi * 0.9**2 * (CAMERA.fx / 3) ** 2, rtol=0.05)
+    x, y = (columns + 0.5) / 4 - 0.5 - CAMERA.cx, (rows + 0.5) / 4 - 0.5 - CAMERA.cy
+    rays = np.stack([x / CAMERA.fx, y / CAMERA.fy, np.ones(len(rows))], axis=1)
+    points = rays * (centers[0] @ tilted / (rays @ tilted))[:, None]
+    assert np.linalg.norm(points - centers[0], axis=1).max() < 0.2 + 2 * 2 / (4 * CAMERA.fx)  # but for two pixels
+    area = 1.5 * np.sqrt(3) * np.array([0.2, 0.7]) ** 2 * (4 * CAMERA.fx / np.array([2, 3])) ** 2
+    np.testing.assert_allclose(len(rows), 0.8 * area[0], rtol=0.05)
+    np.testing.assert_allclose((index >= 0).sum(), area[1], rtol=0.05)
     assert set(np.unique(index)) == {-1, 0, 1}
 
 
@@ -244,7 +248,7 @@ def test_colours_are_distinct_and_do_not_depend_on_their_number() -> None:
 def test_nothing_that_draws_is_imported_before_it_is_needed() -> None:
     program = (
         "import sys, kmn_jax.viz._picture, kmn_jax.viz._viewer;"
-        "print([name for name in ('matplotlib', 'viser', 'scipy.spatial') if name in sys.modules])"
+        "print([name for name in ('matplotlib', 'viser', 'scipy.spatial', 'PIL') if name in sys.modules])"
     )
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert (result.returncode, result.stdout.strip()) == (0, "[]"), result.stderr
