@@ -12,7 +12,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-LOCKED_EXTRAS = ("data", "train", "dev")
+LOCKED_EXTRAS = ("detect", "data", "train", "dev")
 
 
 def read_lock(name: str) -> dict[str, tuple[str, int]]:
