@@ -92,7 +92,7 @@ def detect(
     Args:
         request: what to look for, and where.
         top: return the first poses only.
-        json: file for the result as JSON, see docs/estimate.md.
+        json: file for the result as JSON, see docs/detect.md.
         bop_csv: file for the result as BOP's csv.
         save_picture: file for a picture of scene, segmentation, keypoints and poses (PNG).
     """
@@ -162,7 +162,7 @@ def export(
 
     Args:
         object: CAD file, cloud of the whole surface, or object card (.kmn).
-        output: the artefact; docs/estimate.md tells how to call it.
+        output: the artefact; docs/detect.md tells how to call it.
         units: unit of the object's lengths and of the scans that the artefact will be given; auto: the object's own.
         points: how many points its scans hold at most.
         weights: released network, or a .safetensors file.

@@ -17,7 +17,7 @@ _COLUMNS = ("rank", "probability", "visible", "gap", "inliers", "x", "y", "z", "
 
 
 def as_json(found: Detections, object_name: str, scene_name: str, facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a result as JSON values, see docs/estimate.md; `facts`, such as the command's settings, are added."""
+    """Return a result as JSON values, see docs/detect.md; `facts`, such as the command's settings, are added."""
     return {
         "version": SCHEMA_VERSION,
         "unit": found.unit,

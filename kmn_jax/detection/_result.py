@@ -1,4 +1,4 @@
-"""What an estimate returns: plain records on the host, in the scene's frame and unit."""
+"""What a search returns: plain records on the host, in the scene's frame and unit."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-SCHEMA_VERSION = 1  # of the JSON form, see docs/estimate.md
+SCHEMA_VERSION = 1  # of the JSON form, see docs/detect.md
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Detection:
     """
 
     T_scene_object: Float[np.ndarray, "4 4"]  # float64, lengths in the scene's unit
-    probability: float  # of being correct: ADI below a tenth of the diameter, see docs/estimate.md
+    probability: float  # of being correct: ADI below a tenth of the diameter, see docs/detect.md
     num_inliers: int  # matches of scene points with keypoints that agree on the pose
     visible_fraction: float  # share that nothing measured hides
     runner_up_gap: float  # by how much the best other pose at this place is less probable

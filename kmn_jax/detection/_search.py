@@ -137,12 +137,12 @@ def crop_prediction(found: Candidates, row: int) -> CropPrediction:
 
 def network_prediction(prediction: Prediction, seed: Float[Array | np.ndarray, "3"]) -> CropPrediction:
     """Return what the network says of a draw's points, as a plain record in the frame that the seed is in."""
-    mask = np.asarray(prediction.mask)
-    return CropPrediction(
-        (np.asarray(prediction.points) + np.asarray(seed))[mask],
-        np.asarray(prediction.on_object)[mask],
-        np.asarray(prediction.logits).argmax(axis=1).astype(np.int32)[mask],
+    points, segmentation, logits = (
+        np.asarray(leaf)[np.asarray(prediction.mask)]
+        for leaf in (prediction.points, prediction.segmentation, prediction.logits)
     )
+    on_object = segmentation[:, 1] > segmentation[:, 0]
+    return CropPrediction(points + np.asarray(seed), on_object, logits.argmax(axis=1).astype(np.int32))
 
 
 def search_one(

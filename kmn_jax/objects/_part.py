@@ -1,4 +1,4 @@
-"""Object cards: all that an estimate needs to know of an object, made once, and the network's features of it."""
+"""Object cards: all that a search needs to know of an object, made once, and the network's features of it."""
 
 from __future__ import annotations
 
