@@ -95,7 +95,7 @@ def collision_hulls(
     Raises:
         InputError: the surface is empty, not finite, or flat.
     """
-    corners = _triangle_corners(vertices, triangles)
+    corners = triangle_corners(vertices, triangles)
     low = corners.min(axis=(0, 1))
     diagonal = float(np.linalg.norm(corners.max(axis=(0, 1)) - low))
     unit = (corners - low) / (diagonal or 1.0)
@@ -116,15 +116,18 @@ def collision_hulls(
     return [_hull_corners(piece.triangles) * diagonal + low for piece in pieces]
 
 
-def _triangle_corners(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def triangle_corners(
+    vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]
+) -> Float[np.ndarray, "t 3 3"]:
+    """Return the corners of a surface's triangles; raise InputError for one that is empty or not finite."""
     vertices, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(triangles)
     if len(triangles) == 0 or len(vertices) == 0:
-        raise InputError("the surface has no triangles: there is nothing to collide with")
+        raise InputError("the surface has no triangles: there is nothing to see or to collide with")
     if triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise InputError(f"triangles refer to vertices {triangles.min()} to {triangles.max()} of {len(vertices)}")
+        raise InputError(f"triangles name vertices from {triangles.min()} to {triangles.max()} of {len(vertices)}")
     corners = vertices[triangles]
     if not np.isfinite(corners).all():
-        raise InputError("the surface has vertices that are NaN or infinite: repair the mesh first")
+        raise InputError("the surface has vertices that are NaN or infinite: export the part again")
     return corners
 
 

@@ -48,7 +48,7 @@ def of_mesh(mesh: Mesh) -> Part:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    depth = render(RayMesh(*notched_box()), camera_scene([TRUE], CAMERA), include_bin=False).depth.astype(np.float32)
+    depth = render(RayMesh(*notched_box()), camera_scene([TRUE], CAMERA)).depth.astype(np.float32)
     view = view_of(Scan(measured_points(depth, CAMERA), None, depth, CAMERA, "m"))
     return make_scene(view, "m", np.ones(len(view.points), dtype=bool), 131_072)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -80,8 +81,14 @@ def random_rotations(count: int, seed: int) -> np.ndarray:
 
 
 def camera_scene(poses: list[np.ndarray], camera: Camera) -> BinScene:
-    """Return a scene whose poses are given in the camera frame; its bin is not to be rendered."""
-    return BinScene(Bin(1.0, 1.0, 1.0, 0.1), np.array(poses).reshape(-1, 4, 4), camera, np.eye(4))
+    """Return a scene whose poses are given in the camera frame; its bin is out of sight."""
+    return without_bin(BinScene(Bin(1.0, 1.0, 1.0, 0.1), np.array(poses).reshape(-1, 4, 4), camera, np.eye(4)))
+
+
+def without_bin(scene: BinScene) -> BinScene:
+    """Return a scene with its bin behind the camera, where it is neither seen nor hides anything."""
+    T_camera_bin = pose((0, 0, -10.0))
+    return replace(scene, T_bin_object=np.linalg.inv(T_camera_bin) @ scene.T_camera_object, T_camera_bin=T_camera_bin)
 
 
 def pile(count: int, camera: Camera, seed: int = 0, height: float = 7.0) -> BinScene:

@@ -182,8 +182,8 @@ BOX = boxes(([0, 0, 0], [1, 1, 1]))
         (BOX[0], BOX[1][:0], "no triangles"),
         (BOX[0][:0], BOX[1][:0], "no triangles"),
         (np.where(BOX[0] == 1, np.nan, BOX[0]), BOX[1], "NaN"),
-        (BOX[0], BOX[1] + 5, "refer to vertices 5 to 12 of 8"),
-        (BOX[0], BOX[1] - 1, "refer to vertices -1 to 6 of 8"),
+        (BOX[0], BOX[1] + 5, "name vertices from 5 to 12 of 8"),
+        (BOX[0], BOX[1] - 1, "name vertices from -1 to 6 of 8"),
     ],
 )
 def test_surfaces_without_volume_are_refused(vertices, triangles, message, capfd):
