@@ -6,6 +6,7 @@ copies. All of it is one scene at a time, in arrays of a fixed size.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -14,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from kmn_jax.errors import InputError
 from kmn_jax.geometry import Intrinsics, inverse
 from kmn_jax.typing import Mask, Normals, Points, Pose, Scalar
 
@@ -21,7 +23,15 @@ BIN = -1  # the instance of points on the bin
 
 # Of the plastic number, in units of 2**-32: the two-dimensional sequence that spreads most evenly (Roberts, "R2").
 _STEPS = (3242174889, 2447445414)
-_STEEPEST = 1.5  # a disc's depth departs from its centre's by at most this many spacings
+
+# In the surfels' mean spacing. These agree best with ray casting on piles of electronic components and mechanical parts,
+# see benchmarks/scenes.py. Discs reach beyond the edge of a surface. So that they do not hide the face next to it,
+# whether a point is hidden is asked for a place above it, along its normal.
+_PIXEL = 0.75  # side of a pixel at the surfels' mean depth, more if the scene is too large for the buffer
+_DISC_RADIUS = 0.9
+_STEEPEST = 1.5  # a disc's depth departs from its centre's by at most this
+_LIFT = 0.6  # how far above a point its visibility is tested
+_TOLERANCE = 0.4  # how far behind the buffer that place may lie
 
 
 class Surfels(NamedTuple):
@@ -53,28 +63,14 @@ class VisiblePoints(NamedTuple):
 
 @dataclass(frozen=True)
 class SplatConfig:
-    """Choose buffer and tolerances of the splatting; lengths are multiples of the surfels' mean spacing.
-
-    The defaults agree best with ray casting on piles of electronic components and mechanical parts, see
-    benchmarks/scenes.py. Discs reach beyond the edge of a surface. So that they do not hide the face next to it,
-    whether a point is hidden is asked for a place above it, along its normal.
-    """
+    """Choose how finely splatting draws."""
 
     resolution: int = 512  # pixels of the z-buffer along each side
-    pixel: float = 0.75  # side of a pixel at the surfels' mean depth, more if the scene is too large for the buffer
-    disc_radius: float = 0.9
-    lift: float = 0.6  # how far above a point its visibility is tested
-    tolerance: float = 0.4  # how far behind the buffer that place may lie
     num_bin_surfels: int = 16384  # points made on the bin's floor and walls if there is a bin
 
     def __post_init__(self) -> None:
         if self.resolution < 2 or self.num_bin_surfels < 1:
-            raise ValueError(f"resolution = {self.resolution} and num_bin_surfels = {self.num_bin_surfels} are too few")
-        lengths = (self.pixel, self.disc_radius, self.lift, self.tolerance)
-        if min(lengths) < 0 or min(lengths[:2]) <= 0:
-            raise ValueError(
-                f"pixel, disc_radius, lift, tolerance are {lengths}: none below zero, nor the first two zero"
-            )
+            raise InputError(f"resolution = {self.resolution} and num_bin_surfels = {self.num_bin_surfels} are too few")
 
 
 @partial(jax.jit, static_argnames="count")
@@ -124,13 +120,13 @@ def visible_from_bits(
     `copies` is false for padding, whose poses and bits may hold anything. With a bin and its bits there are 8 bin
     surfels, those of `bin_surfels`, for each of their bytes. They are few for so large a surface; `bin_splits` cuts the
     square that each stands for into so many rows and columns of points, which are all visible or none. Raises
-    ValueError if bits and surfels differ in number, or if only one of bin and bin bits is given.
+    InputError if bits and surfels differ in number, or if only one of bin and bin bits is given.
     """
     m = surfels.points.shape[0]
     if 8 * bits.shape[1] != m:
-        raise ValueError(f"{8 * bits.shape[1]} bits a copy do not fit {m} surfels")
+        raise InputError(f"{8 * bits.shape[1]} bits a copy do not fit {m} surfels")
     if (bin_in_view is None) != (bin_bits is None):
-        raise ValueError("bin_in_view and bin_bits belong together: give both or none")
+        raise InputError("bin_in_view and bin_bits belong together: give both or none")
     num_copies = copies.shape[0]
     visible = jnp.unpackbits(bits, axis=1, bitorder="little").reshape(-1) > 0
     placed = _place(surfels, T_camera_object, copies)
@@ -160,12 +156,12 @@ def visible_by_splatting(
     spacing = jnp.sqrt(surfels.area / surfels.points.shape[0])
     placed = _place(surfels, T_camera_object, copies)
     drawn = _facing(placed) & _in_image(placed, camera)
-    buffer = _draw(placed, drawn, spacing, config)
-    visible = drawn & _unhidden(placed, buffer, spacing, config)
+    buffer = _draw(placed, drawn, spacing, config.resolution)
+    visible = drawn & _unhidden(placed, buffer, spacing)
     if bin_in_view is None:
         return _gather(placed, visible, num_copies)
     on_bin = _place_bin(bin_in_view, config.num_bin_surfels)
-    bin_visible = _facing(on_bin) & _in_image(on_bin, camera) & _unhidden(on_bin, buffer, spacing, config)
+    bin_visible = _facing(on_bin) & _in_image(on_bin, camera) & _unhidden(on_bin, buffer, spacing)
     visible, bin_visible = (
         seen & _over_rim(rows, bin_in_view) for seen, rows in ((visible, placed), (bin_visible, on_bin))
     )
@@ -248,9 +244,8 @@ def _over_rim(placed: _Placed, bin_in_view: BinInView) -> Mask:
     return (z >= height) | (across & (eye[2] > height))
 
 
-def _draw(placed: _Placed, drawn: Mask, spacing: Scalar, config: SplatConfig) -> _Buffer:
+def _draw(placed: _Placed, drawn: Mask, spacing: Scalar, size: int) -> _Buffer:
     """Draw each surfel's disc at the four pixels around its projection and keep the least depth."""
-    size = config.resolution
     x, y, z = placed.points
     directions = [coordinate / jnp.where(drawn, z, 1) for coordinate in (x, y)]
     count = drawn.sum()
@@ -260,7 +255,7 @@ def _draw(placed: _Placed, drawn: Mask, spacing: Scalar, config: SplatConfig) ->
         for bound, worst in ((jnp.min, jnp.inf), (jnp.max, -jnp.inf))
     )
     mean_depth = jnp.where(some, jnp.where(drawn, z, 0).sum() / jnp.maximum(count, 1).astype(jnp.float32), 1)
-    finest = config.pixel * spacing / mean_depth
+    finest = _PIXEL * spacing / mean_depth
     pitch = [jnp.maximum((end - begin) / (size - 1), finest) for begin, end in zip(low, high, strict=True)]
     buffer = _Buffer(jnp.full(size * size, jnp.inf), (low[0], low[1]), (pitch[0], pitch[1]))
     columns, rows = _pixels(placed.points, buffer)
@@ -272,7 +267,7 @@ def _draw(placed: _Placed, drawn: Mask, spacing: Scalar, config: SplatConfig) ->
         column, row = first_column + corner[0], first_row + corner[1]
         u, v, disc_depth = _plane_depth(placed, buffer, column, row, spacing)
         square_distance = (u * disc_depth - x) ** 2 + (v * disc_depth - y) ** 2 + (disc_depth - z) ** 2
-        covered = (square_distance <= (config.disc_radius * spacing) ** 2) | (
+        covered = (square_distance <= (_DISC_RADIUS * spacing) ** 2) | (
             (column == nearest_column) & (row == nearest_row)
         )
         covered = covered & drawn & (column < size) & (row < size)
@@ -283,14 +278,14 @@ def _draw(placed: _Placed, drawn: Mask, spacing: Scalar, config: SplatConfig) ->
     return buffer._replace(depth=jax.lax.scan(draw_corner, buffer.depth, corners)[0])
 
 
-def _unhidden(placed: _Placed, buffer: _Buffer, spacing: Scalar, config: SplatConfig) -> Bool[Array, " r"]:
+def _unhidden(placed: _Placed, buffer: _Buffer, spacing: Scalar) -> Bool[Array, " r"]:
     """Tell which points that face the camera are, lifted off their surface, at most the tolerance behind the buffer."""
-    size, lift = config.resolution, config.lift * spacing
+    size, lift = math.isqrt(len(buffer.depth)), _LIFT * spacing
     x, y, z = (place + lift * normal for place, normal in zip(placed.points, placed.normals, strict=True))
     columns, rows = (jnp.round(pixel) for pixel in _pixels((x, y, z), buffer))
     outside = (columns < 0) | (columns >= size) | (rows < 0) | (rows >= size)
     depth = buffer.depth[jnp.where(outside, 0, rows * size + columns).astype(jnp.int32)]
-    return outside | (z <= depth + config.tolerance * spacing)
+    return outside | (z <= depth + _TOLERANCE * spacing)
 
 
 def _pixels(
