@@ -24,9 +24,9 @@ BIN = -1  # the instance of points on the bin
 # Of the plastic number, in units of 2**-32: the two-dimensional sequence that spreads most evenly (Roberts, "R2").
 _STEPS = (3242174889, 2447445414)
 
-# In the surfels' mean spacing. These agree best with ray casting on piles of electronic components and mechanical parts,
-# see benchmarks/scenes.py. Discs reach beyond the edge of a surface. So that they do not hide the face next to it,
-# whether a point is hidden is asked for a place above it, along its normal.
+# In the surfels' mean spacing. These agree best with ray casting on piles of electronic components and mechanical
+# parts, see benchmarks/scenes.py. Discs reach beyond the edge of a surface. So that they do not hide the face next to
+# it, whether a point is hidden is asked for a place above it, along its normal.
 _PIXEL = 0.75  # side of a pixel at the surfels' mean depth, more if the scene is too large for the buffer
 _DISC_RADIUS = 0.9
 _STEEPEST = 1.5  # a disc's depth departs from its centre's by at most this

@@ -21,7 +21,7 @@ def image(tmp_path: Path) -> Path:
 
 def test_it_is_the_frame_of_its_dataset(image: Path) -> None:
     scan, instances = bop_scan(image)
-    frame = BopDataset.open(image.parents[3], "test").frame(3, 1)
+    frame = BopDataset(image.parents[3], "test").frame(3, 1)
     assert is_bop_image(image)
     assert (scan.unit, scan.camera, scan.normals) == ("mm", frame.camera, None)
     np.testing.assert_array_equal(scan.depth, frame.depth)
