@@ -121,14 +121,6 @@ class BopDataset:
             raise InputError(f"object {object_id} has no usable model: {reason}")
         return models[object_id]
 
-    @property
-    def camera(self) -> Camera | None:
-        """The sensor of camera.json, None without that file; frames have cameras of their own."""
-        camera, fault = self._camera
-        if fault is not None:
-            raise fault
-        return camera
-
     def _reader(self, scene: Scene, image_id: int) -> FrameReader:
         return FrameReader(scene, image_id, self._factor, self.object_ids, self._camera[0])
 
@@ -149,6 +141,7 @@ class BopDataset:
 
     @cached_property
     def _camera(self) -> tuple[Camera | None, BopFault | None]:
+        """The sensor of camera.json, whose size that of images is compared with, or what is wrong with it."""
         file = self.folder / of_sensor("camera", self.sensor, ".json")
         if not file.exists():
             return None, None

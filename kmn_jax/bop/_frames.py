@@ -6,13 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeAlias
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from kmn_jax.bop._files import Entry, pose_entry, pose_keys
 from kmn_jax.errors import InputError
-from kmn_jax.geometry import Camera, depth_to_points
+from kmn_jax.geometry import Camera
 from kmn_jax.simulate import Bin, BinScene
 
 Box: TypeAlias = tuple[int, int, int, int]  # left, top, width, height in pixels; a silhouette may leave the image
@@ -67,10 +66,6 @@ class BopFrame:
                     " one image for each instance"
                 )
 
-    def points(self) -> Float[Array, "h w 3"]:
-        """Return the points of the depth image in the camera frame; the zero point where nothing was measured."""
-        return depth_to_points(jnp.asarray(self.depth, jnp.float32), jnp.asarray(self.camera.matrix, jnp.float32))
-
     def with_visibility(self) -> BopFrame:
         """Return the frame with the boxes, counts and fractions that its masks tell and its instances lack."""
         if self.instances is None or (self.masks is None and self.visible_masks is None):
@@ -98,24 +93,18 @@ def scene_frame(
     object_id: int,
     depth: Float[np.ndarray, "h w"],
     instances: Int[np.ndarray, "h w"],
-    total_pixels: Int[np.ndarray, " n"] | None = None,
-    total_boxes: Int[np.ndarray, "n 4"] | None = None,
+    total_pixels: Int[np.ndarray, " n"],
+    total_boxes: Int[np.ndarray, "n 4"],
 ) -> BopFrame:
     """Return the frame of a rendered bin: `instances` holds the number of the copy that each pixel shows.
 
-    `total_pixels` and `total_boxes` are the size and the box of each copy's silhouette, without what hides it; unless
-    they are given, the visible fractions stay unknown. The depth may be that of a sensor.
+    `total_pixels` and `total_boxes` are the size and the box of each copy's silhouette, without what hides it. The
+    depth may be that of a sensor.
     """
-    poses = scene.T_camera_object
     placed = []
-    for index, pose in enumerate(poses):
-        count = None if total_pixels is None else int(total_pixels[index])
-        box = None
-        if total_boxes is not None and count != 0:
-            left, top, width, height = total_boxes[index].tolist()
-            box = (left, top, width, height)
-        placed.append(BopInstance(object_id, pose, box=box, num_pixels=count))
-    visible = instances[None] == np.arange(len(poses))[:, None, None]
+    for pose, count, box in zip(scene.T_camera_object, total_pixels.tolist(), total_boxes.tolist(), strict=True):
+        placed.append(BopInstance(object_id, pose, box=tuple(box) if count else None, num_pixels=count))
+    visible = instances[None] == np.arange(len(placed))[:, None, None]
     frame = BopFrame(
         scene.camera, depth, tuple(placed), bin=scene.bin, T_camera_bin=scene.T_camera_bin, visible_masks=visible
     )

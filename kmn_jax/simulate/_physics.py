@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -109,19 +108,17 @@ def settle(shape: CollisionShape, copies: int, config: BinConfig, random_seed: i
         random_seed: one number or several, 0 or more, such as those of the run, of the object and of the drop.
 
     Raises:
-        InputError: there are no copies, a random seed is negative, or the shape has no volume.
+        InputError: there are no copies, or a random seed is negative.
     """
     if copies < 1:
         raise InputError(f"copies is {copies}, but a bin needs 1 or more")
     if np.min(random_seed, initial=0) < 0:
         raise InputError(f"random_seed is {random_seed}, but must be 0 or more")
-    if not (0 < shape.diagonal < math.inf and 0 < shape.volume < math.inf):
-        raise InputError(
-            f"the collision shape has diagonal {shape.diagonal} and volume {shape.volume}: both must be > 0"
-        )
     rng = np.random.default_rng(random_seed)
     body = _Body(shape)
-    least, most = _bin_scales(shape, copies, config)
+    room = config.packing * config.length * config.width * config.height[0] * shape.diagonal**3
+    most = config.scale[1]
+    least = min(max(config.scale[0], math.sqrt(copies * shape.volume / room)), most)
     rejected: list[str] = []
     for _ in range(config.attempts):
         scale = rng.uniform(least, most)
@@ -167,13 +164,6 @@ class _Body:
         T_bin_object[:, :3, :3] = rotation
         T_bin_object[:, :3, 3] = T_bin_body[:, :3, 3] / self.scale - rotation @ self.shape.center
         return T_bin_object
-
-
-def _bin_scales(shape: CollisionShape, copies: int, config: BinConfig) -> tuple[float, float]:
-    """Return the range of scales whose bins hold the copies; the largest scale where none does."""
-    room = config.packing * config.length * config.width * config.height[0] * shape.diagonal**3
-    least = math.sqrt(copies * shape.volume / room)
-    return min(max(config.scale[0], least), config.scale[1]), config.scale[1]
 
 
 def _spawn(body: _Body, copies: int, size: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
@@ -258,9 +248,14 @@ def _simulate(body: _Body, T_bin_body: np.ndarray, size: np.ndarray, config: Bin
     data.qpos[:] = np.concatenate([T_bin_body[:, :3, 3], quaternions], axis=1).ravel()
     steps = round(config.check_every / config.step)
     checks, calm = max(1, round(config.time_cap / config.check_every)), 0
+    # Lest mujoco writes a log file into the working directory; its warnings are counted in the data.
+    previous = mujoco.get_mju_user_warning()
     for _ in range(checks):
-        with _warnings_unprinted():
+        mujoco.set_mju_user_warning(lambda message: None)
+        try:
             mujoco.mj_step(model, data, nstep=steps)
+        finally:
+            mujoco.set_mju_user_warning(previous)
         if data.warning.number.any():
             break
         speed, rotation = np.linalg.norm(data.qvel.reshape(copies, 2, 3), axis=2).max(axis=0)
@@ -294,16 +289,3 @@ def _simulate(body: _Body, T_bin_body: np.ndarray, size: np.ndarray, config: Bin
         faults.append("a copy touches nothing")
     floor_share = len(np.unique(on_floor[on_floor > 0])) / copies
     return _Rest(poses, ", ".join(faults), penetration, calm < config.rest_checks, floor_share)
-
-
-@contextmanager
-def _warnings_unprinted() -> Iterator[None]:
-    """Keep mujoco from writing a log file into the working directory; its warnings are counted in the data."""
-    import mujoco
-
-    previous = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(previous)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from kmn_jax.errors import InputError
-from kmn_jax.simulate import BinConfig, CollisionShape, collision_shape, settle
+from kmn_jax.simulate import BinConfig, collision_shape, settle
 
 CONFIG = BinConfig()
 
@@ -182,13 +182,6 @@ def test_parts_of_one_copy_do_not_push_each_other():
 def test_wrong_arguments_are_refused(copies, seed, message):
     with pytest.raises(InputError, match=message):
         settle(BOX, copies, CONFIG, seed)
-
-
-@pytest.mark.parametrize(("diagonal", "volume"), [(0.0, 1.0), (1.0, 0.0), (math.nan, 1.0), (1.0, math.inf)])
-def test_shapes_without_volume_are_refused(diagonal, volume):
-    shape = CollisionShape(BOX.parts, diagonal, volume, BOX.center, BOX.R_object_principal, BOX.inertia)
-    with pytest.raises(InputError, match="diagonal"):
-        settle(shape, 1, CONFIG, 0)
 
 
 @pytest.mark.parametrize(
