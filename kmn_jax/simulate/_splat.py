@@ -127,14 +127,13 @@ def visible_from_bits(
         raise InputError(f"{8 * bits.shape[1]} bits a copy do not fit {m} surfels")
     if (bin_in_view is None) != (bin_bits is None):
         raise InputError("bin_in_view and bin_bits belong together: give both or none")
-    num_copies = copies.shape[0]
     visible = jnp.unpackbits(bits, axis=1, bitorder="little").reshape(-1) > 0
     placed = _place(surfels, T_camera_object, copies)
     if bin_in_view is None or bin_bits is None:
-        return _gather(placed, visible, num_copies)
+        return _gather(len(copies), (placed, visible))
     on_bin = _place_bin(bin_in_view, 8 * bin_bits.shape[0], bin_splits)
     bin_visible = jnp.tile(jnp.unpackbits(bin_bits, bitorder="little") > 0, bin_splits**2)
-    return _gather(placed, visible, num_copies, on_bin, bin_visible)
+    return _gather(len(copies), (placed, visible), (on_bin, bin_visible))
 
 
 def visible_by_splatting(
@@ -152,20 +151,17 @@ def visible_by_splatting(
     Copies are padded as in `visible_from_bits`. What the bin's walls hide from a camera above the rim is exact; a
     camera below it sees only what rises above it.
     """
-    num_copies = copies.shape[0]
     spacing = jnp.sqrt(surfels.area / surfels.points.shape[0])
     placed = _place(surfels, T_camera_object, copies)
     drawn = _facing(placed) & _in_image(placed, camera)
     buffer = _draw(placed, drawn, spacing, config.resolution)
     visible = drawn & _unhidden(placed, buffer, spacing)
     if bin_in_view is None:
-        return _gather(placed, visible, num_copies)
+        return _gather(len(copies), (placed, visible))
     on_bin = _place_bin(bin_in_view, config.num_bin_surfels)
     bin_visible = _facing(on_bin) & _in_image(on_bin, camera) & _unhidden(on_bin, buffer, spacing)
-    visible, bin_visible = (
-        seen & _over_rim(rows, bin_in_view) for seen, rows in ((visible, placed), (bin_visible, on_bin))
-    )
-    return _gather(placed, visible, num_copies, on_bin, bin_visible)
+    parts = ((rows, seen & _over_rim(rows, bin_in_view)) for rows, seen in ((placed, visible), (on_bin, bin_visible)))
+    return _gather(len(copies), *parts)
 
 
 class _Placed(NamedTuple):
@@ -307,29 +303,26 @@ def _plane_depth(
     return u, v, jnp.clip(depth, z - reach, z + reach)
 
 
-def _gather(
-    placed: _Placed,
-    visible: Bool[Array, " m"],
-    num_copies: int,
-    on_bin: _Placed | None = None,
-    bin_visible: Bool[Array, " b"] | None = None,
-) -> VisiblePoints:
-    """Join objects and bin into the result."""
-    picture_area = _picture_area(placed)
-    unhidden = picture_area.reshape(num_copies, -1).sum(axis=1)
-    seen = jnp.where(visible, picture_area, 0).reshape(num_copies, -1).sum(axis=1)
-    instance = jnp.repeat(jnp.arange(num_copies, dtype=jnp.int32), visible.shape[0] // num_copies)
-    points, normals, mask = [*placed.points], [*placed.normals], visible & placed.real
-    if on_bin is not None and bin_visible is not None:
-        points, normals = (
-            [jnp.concatenate(pair) for pair in zip(rows, added, strict=True)]
-            for rows, added in ((points, on_bin.points), (normals, on_bin.normals))
-        )
-        picture_area = jnp.concatenate([picture_area, _picture_area(on_bin)])
-        instance = jnp.concatenate([instance, jnp.full(bin_visible.shape, BIN, dtype=jnp.int32)])
-        mask = jnp.concatenate([mask, bin_visible])
-    fraction = seen / jnp.where(unhidden > 0, unhidden, 1)
-    return VisiblePoints(jnp.stack(points, axis=1), jnp.stack(normals, axis=1), picture_area, instance, mask, fraction)
+def _gather(num_copies: int, *parts: tuple[_Placed, Mask]) -> VisiblePoints:
+    """Join the surfels of the copies, and those of the bin if given, with which of them are visible."""
+    points, normals = (
+        jnp.stack([jnp.concatenate(column) for column in zip(*rows, strict=True)], axis=1)
+        for rows in ([placed.points for placed, _ in parts], [placed.normals for placed, _ in parts])
+    )
+    areas = [_picture_area(placed) for placed, _ in parts]
+    _, visible = parts[0]
+    unhidden = areas[0].reshape(num_copies, -1).sum(axis=1)
+    seen = jnp.where(visible, areas[0], 0).reshape(num_copies, -1).sum(axis=1)
+    instances = [jnp.repeat(jnp.arange(num_copies, dtype=jnp.int32), visible.shape[0] // num_copies)]
+    instances += [jnp.full(on_bin.shape, BIN, dtype=jnp.int32) for _, on_bin in parts[1:]]
+    return VisiblePoints(
+        points,
+        normals,
+        jnp.concatenate(areas),
+        jnp.concatenate(instances),
+        jnp.concatenate([visible & placed.real for placed, visible in parts]),
+        seen / jnp.where(unhidden > 0, unhidden, 1),
+    )
 
 
 def _picture_area(placed: _Placed) -> Float[Array, " r"]:
