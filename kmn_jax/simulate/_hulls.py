@@ -70,24 +70,7 @@ DIRECTIONS = _fibonacci_sphere(256)  # cuts are compared on the outermost points
 def collision_shape(
     vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], config: HullConfig = HullConfig()
 ) -> CollisionShape:
-    """Return the convex parts of a surface and the mass properties of their union, for `settle`.
-
-    Raises:
-        InputError: the surface is empty, not finite, or flat.
-    """
-    parts = collision_hulls(vertices, triangles, config)
-    corners = np.asarray(vertices, dtype=np.float64)[np.unique(triangles)]
-    diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
-    volume, center, inertia = _mass_properties(parts)
-    moments, axes = np.linalg.eigh(inertia)
-    axes[:, 2] *= np.sign(np.linalg.det(axes))
-    return CollisionShape(tuple(parts), diagonal, volume, center, axes, moments / volume)
-
-
-def collision_hulls(
-    vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], config: HullConfig = HullConfig()
-) -> list[Float[np.ndarray, "_ 3"]]:
-    """Cut a surface along its frame's axes where that empties most volume; return the corners of the parts' hulls.
+    """Cut a surface along its frame's axes where that empties most volume; return the parts' hulls, for `settle`.
 
     The surface need be neither closed nor consistently wound: the parts cover all of it, holes and recesses too where
     no cut opens them. The result is deterministic.
@@ -113,7 +96,11 @@ def collision_hulls(
             break
         pieces[best : best + 1] = halves
         cuts[best : best + 1] = [_best_cut(half, whole, config) for half in halves]
-    return [_hull_corners(piece.triangles) * diagonal + low for piece in pieces]
+    parts = tuple(_hull_corners(piece.triangles) * diagonal + low for piece in pieces)
+    volume, center, inertia = _mass_properties(parts)
+    moments, axes = np.linalg.eigh(inertia)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    return CollisionShape(parts, diagonal, volume, center, axes, moments / volume)
 
 
 def triangle_corners(

@@ -303,7 +303,7 @@ def _plane_depth(
     return u, v, jnp.clip(depth, z - reach, z + reach)
 
 
-def _gather(num_copies: int, *parts: tuple[_Placed, Mask]) -> VisiblePoints:
+def _gather(num_copies: int, *parts: tuple[_Placed, Bool[Array, " _"]]) -> VisiblePoints:
     """Join the surfels of the copies, and those of the bin if given, with which of them are visible."""
     points, normals = (
         jnp.stack([jnp.concatenate(column) for column in zip(*rows, strict=True)], axis=1)
