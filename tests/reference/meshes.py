@@ -12,6 +12,9 @@ from kmn_jax.simulate import Bin, BinScene
 from kmn_jax.simulate._raycast import bin_triangles
 
 Mesh = tuple[np.ndarray, np.ndarray]
+CAMERA = Camera(fx=200.0, fy=190.0, cx=78.3, cy=61.9, width=160, height=120)
+WIDE = Camera(fx=500.0, fy=500.0, cx=199.5, cy=149.5, width=400, height=300)
+TOP = np.diag([1.0, -1, -1])  # the bin from above: its x to the right, its y upwards in the picture
 
 
 def box(*extents: float) -> Mesh:

@@ -13,6 +13,9 @@ from kmn_jax.geometry import Camera, depth_to_points
 from kmn_jax.simulate import Bin, BinScene, RayMesh, render, visible_bin_surfels, visible_surfels
 from kmn_jax.simulate._raycast import Rendering, bin_triangles
 from tests.reference.meshes import (
+    CAMERA,
+    TOP,
+    WIDE,
     box,
     bracket,
     camera_scene,
@@ -24,10 +27,6 @@ from tests.reference.meshes import (
     square,
     without_bin,
 )
-
-CAMERA = Camera(fx=200.0, fy=190.0, cx=78.3, cy=61.9, width=160, height=120)
-WIDE = Camera(fx=500.0, fy=500.0, cx=199.5, cy=149.5, width=400, height=300)
-TOP = np.diag([1.0, -1, -1])  # the bin from above: its x to the right, its y upwards in the picture
 
 
 def same(first: Rendering, second: Rendering) -> bool:
