@@ -61,7 +61,7 @@ def bin_images(folder: Path, split: str, model: Model, every: int = 1) -> Iterat
 
     Raises InputError if the folder is no such dataset.
     """
-    dataset = BopDataset.open(folder, split, unit=_UNIT)
+    dataset = BopDataset(folder, split, unit=_UNIT)
     models, problems = load_models(dataset, ObjectConfig(num_points=4096))
     if problems:
         raise InputError(f"{folder}: {problems[0]}")

@@ -58,7 +58,7 @@ class ShowData:
             for name in _spread(pack.names(), self.objects):
                 self._save(_pack_figure(pack, name, self), f"pack_{name.replace('/', '_')}.png")
         if self.test_set is not None:
-            dataset = BopDataset.open(self.test_set, self.split)
+            dataset = BopDataset(self.test_set, self.split)
             scenes = sorted({key.scene_id for key in dataset.keys})
             for scene in _spread(scenes, self.objects):
                 images = _spread([key.image_id for key in dataset.keys if key.scene_id == scene], self.drops)

@@ -71,7 +71,7 @@ def build_test_set(
             future.result()
         models = pool.map(_model, [source.path for source in sources])
         write_models(folder, {object_id: model for (object_id, _), model in zip(numbered, models, strict=True)})
-    frame = BopDataset.open(folder, SPLIT)[0]
+    frame = BopDataset(folder, SPLIT)[0]
     write_camera(folder, frame.camera, finest_depth_scale(float(frame.depth.max()), "mm"))
     return dataset_digest(folder)
 

@@ -144,7 +144,7 @@ def test_reach_beyond_the_bin_is_that_of_the_farthest_point() -> None:
 def test_poses_of_the_small_test_set_reproject(object_id: int, record_property: pytest.RecordProperty) -> None:
     """The stored depth is what the stored models, poses, camera and bin give, to half a quantisation step."""
     folder = ASSETS / "small_test_set"
-    dataset = BopDataset.open(folder, "test")
+    dataset = BopDataset(folder, "test")
     assert dataset.problems() == ()
     model = dataset.model(object_id)
     assert model.path is not None
@@ -193,10 +193,10 @@ def test_builds_a_test_set_seen_by_a_sensor_and_keeps_recipes_apart(tmp_path: Pa
         name: test_sets.build_test_set(tmp_path / name, sources, config, chosen, workers=1)
         for name, chosen in (("exact", SensorConfig()), ("sensed", sensor))
     }
-    exact, sensed = (BopDataset.open(tmp_path / name, "test")[0] for name in digests)
+    exact, sensed = (BopDataset(tmp_path / name, "test")[0] for name in digests)
     both = (exact.depth > 0) & (sensed.depth > 0)
     assert 0.5 < both.sum() / (exact.depth > 0).sum() < 0.99  # flanks are missing
-    diagonal = float(np.linalg.norm(BopDataset.open(tmp_path / "exact", "test").model(1).size))
+    diagonal = float(np.linalg.norm(BopDataset(tmp_path / "exact", "test").model(1).size))
     deviation = np.std((sensed.depth - exact.depth)[both])
     assert 0.0005 * diagonal < deviation < 0.01 * diagonal
     assert digests["exact"] != digests["sensed"]

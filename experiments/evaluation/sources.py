@@ -33,7 +33,7 @@ def bop_objects(folder: Path, split: str, report: Report, most_images: int | Non
     What is broken (no ground truth, a depth image of another size, an unknown object, an empty scene) is reported and
     left out. Raises InputError if nothing can be used.
     """
-    dataset = BopDataset.open(folder, split, unit=UNIT)
+    dataset = BopDataset(folder, split, unit=UNIT)
     models, problems = load_models(dataset, OBJECT)
     for problem in (*problems, *map(str, dataset.problems(decode=False))):
         report(problem)

@@ -1,35 +1,17 @@
-"""Datasets in BOP format: frames read on demand, faults named by file and entry. The writers are found here, too."""
+"""Datasets in BOP format: frames read on demand, faults named by file and entry."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
-from kmn_jax.bop._files import BopFault, Entry, millimetres, read_json
-from kmn_jax.bop._frames import BopFrame, BopInstance, scene_frame
-from kmn_jax.bop._models import BopModel, model_ids, read_models, write_models
+from kmn_jax.bop._files import BopFault, Entry, millimetres, of_sensor, read_json
+from kmn_jax.bop._frames import BopFrame
+from kmn_jax.bop._models import BopModel, mesh_files, read_models
 from kmn_jax.bop._reader import FrameReader, Scene
-from kmn_jax.bop._writer import dataset_digest, finest_depth_scale, write_camera, write_scene
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import Camera
-
-__all__ = [
-    "BopDataset",
-    "BopFault",
-    "BopFrame",
-    "BopInstance",
-    "BopModel",
-    "FrameKey",
-    "Problem",
-    "dataset_digest",
-    "finest_depth_scale",
-    "scene_frame",
-    "write_camera",
-    "write_models",
-    "write_scene",
-]
 
 
 class FrameKey(NamedTuple):
@@ -39,21 +21,6 @@ class FrameKey(NamedTuple):
     image_id: int
 
 
-@dataclass(frozen=True)
-class Problem:
-    """A part of a dataset that cannot be used: of a frame, of a scene (`image_id` None), or of neither."""
-
-    file: Path
-    entry: str  # in that file; "" for all of it
-    what: str
-    scene_id: int | None = None
-    image_id: int | None = None
-
-    def __str__(self) -> str:
-        return str(BopFault(self.file, self.entry, self.what))
-
-
-@dataclass(frozen=True)
 class BopDataset:
     """One split of a dataset. Nothing is read before it is asked for; the JSON files of a scene are then kept.
 
@@ -63,40 +30,32 @@ class BopDataset:
     faults, `usable` the frames without one.
     """
 
-    folder: Path
-    split: str
-    unit: str = "mm"
-    sensor: str | None = None
-    models_folder: str = "models"
-    ground_truth: bool = True
-
-    @classmethod
-    def open(
-        cls,
+    def __init__(
+        self,
         folder: str | Path,
         split: str,
         unit: str = "mm",
         sensor: str | None = None,
         models_folder: str = "models",
         ground_truth: bool = True,
-    ) -> BopDataset:
+    ) -> None:
         """Open a split by its folder's name, such as test, test_primesense or train_pbr.
 
         Raises InputError if the folder has no such split.
         """
-        millimetres(unit)
-        dataset = cls(Path(folder), split, unit, sensor, models_folder, ground_truth)
-        if not _scene_folders(dataset.folder / split):
-            known = ", ".join(cls.splits(folder)) or "none: a split is a folder of folders like 000000"
+        self.folder, self.split, self.unit, self.sensor = Path(folder), split, unit, sensor
+        self.models_folder, self.ground_truth = models_folder, ground_truth
+        self._factor = 1 / millimetres(unit)
+        if not self._folders:
+            known = ", ".join(self.splits(folder)) or "none: a split is a folder of folders like 000000"
             raise InputError(f"{folder} has no split {split!r} with scenes; its splits: {known}")
-        return dataset
 
     @staticmethod
     def splits(folder: str | Path) -> tuple[str, ...]:
         """Return the names of a dataset's splits. Raises InputError if there is no such folder."""
         if not Path(folder).is_dir():
             raise InputError(f"{folder} is not a folder: name the folder of a BOP dataset")
-        return tuple(sorted(path.name for path in Path(folder).iterdir() if path.is_dir() and _scene_folders(path)))
+        return tuple(sorted(path.name for path in Path(folder).iterdir() if _numbered(path)))
 
     @cached_property
     def keys(self) -> tuple[FrameKey, ...]:
@@ -117,30 +76,28 @@ class BopDataset:
         if image_id not in scene.image_ids and not scene.faults:
             raise InputError(f"{scene.folder} has no image {image_id}")
         reader = self._reader(scene, image_id)
-        frame = reader.frame(masks)
+        frame = reader.read(masks)
         faults = [*scene.faults, *reader.faults]
         if faults or frame is None:
             more = f" ({len(faults) - 1} more faults: see BopDataset.problems)" if len(faults) > 1 else ""
             raise InputError(f"frame {image_id} of scene {scene_id} cannot be used: {faults[0]}{more}")
         return frame
 
-    def problems(self, decode: bool = True) -> tuple[Problem, ...]:
+    def problems(self, decode: bool = True) -> tuple[BopFault, ...]:
         """Check all of the split and return what is wrong, in the order of scenes and images.
 
         Every image is decoded, or, without `decode`, its size read only, which misses damage further on.
         """
-        found = [_problem(fault) for fault in self._models[1].values()]
-        if (fault := self._camera[1]) is not None:
-            found.append(_problem(fault))
-        taken = set(_scene_folders(self.folder / self.split).values())
+        camera_fault, taken = self._camera[1], set(self._folders.values())
+        found = [*self._models[1].values(), *([camera_fault] if camera_fault else [])]
         what = "has the scene id of another folder and is passed over: rename it"
-        found += [Problem(path, "", what) for path in _numbered(self.folder / self.split) if path not in taken]
+        found += [BopFault(path, "", what) for path in _numbered(self.folder / self.split) if path not in taken]
         for scene_id, scene in self._scenes.items():
-            found += [_problem(fault, scene_id) for fault in scene.faults]
+            found += [fault.of_frame(scene_id) for fault in scene.faults]
             for image_id in scene.image_ids:
                 reader = self._reader(scene, image_id)
-                reader.check(decode)
-                found += [_problem(fault, scene_id, image_id) for fault in reader.faults]
+                reader.read(masks=True, decode=decode)
+                found += [fault.of_frame(scene_id, image_id) for fault in reader.faults]
         return tuple(found)
 
     def usable(self, decode: bool = True) -> tuple[FrameKey, ...]:
@@ -150,11 +107,13 @@ class BopDataset:
 
     @cached_property
     def object_ids(self) -> tuple[int, ...] | None:
-        """The ids of the objects that have a model, None if the dataset has no models."""
-        return model_ids(self.folder / self.models_folder)
+        """The ids of the objects that have a mesh or are told of, None if the dataset has no models."""
+        models, faults = self._models
+        told = {*models, *(object_id for object_id in faults if object_id is not None)}
+        return tuple(sorted(told | set(mesh_files(self.folder / self.models_folder)))) or None
 
     def model(self, object_id: int) -> BopModel:
-        """Return an object's size and symmetries. Raises InputError if they are missing or broken."""
+        """Return an object's size and mesh. Raises InputError if they are missing or broken."""
         models, faults = self._models
         if object_id not in models:
             fault = faults.get(object_id, faults.get(None))
@@ -162,21 +121,18 @@ class BopDataset:
             raise InputError(f"object {object_id} has no usable model: {reason}")
         return models[object_id]
 
-    @property
-    def camera(self) -> Camera | None:
-        """The sensor of camera.json, None without that file; frames have cameras of their own."""
-        camera, fault = self._camera
-        if fault is not None:
-            raise fault
-        return camera
-
     def _reader(self, scene: Scene, image_id: int) -> FrameReader:
-        return FrameReader(scene, image_id, 1 / millimetres(self.unit), self.object_ids, self._camera[0])
+        return FrameReader(scene, image_id, self._factor, self.object_ids, self._camera[0])
+
+    @cached_property
+    def _folders(self) -> dict[int, Path]:
+        """The folders of the scenes by id, in order; the first one where two have the same."""
+        folders = {int(path.name): path for path in reversed(_numbered(self.folder / self.split))}
+        return dict(sorted(folders.items()))
 
     @cached_property
     def _scenes(self) -> dict[int, Scene]:
-        folders = dict(sorted(_scene_folders(self.folder / self.split).items()))
-        return {scene_id: Scene(path, self.sensor, self.ground_truth) for scene_id, path in folders.items()}
+        return {scene_id: Scene(path, self.sensor, self.ground_truth) for scene_id, path in self._folders.items()}
 
     @cached_property
     def _models(self) -> tuple[dict[int, BopModel], dict[int | None, BopFault]]:
@@ -185,28 +141,17 @@ class BopDataset:
 
     @cached_property
     def _camera(self) -> tuple[Camera | None, BopFault | None]:
-        file = self.folder / (f"camera_{self.sensor}.json" if self.sensor else "camera.json")
+        """The sensor of camera.json, whose size that of images is compared with, or what is wrong with it."""
+        file = self.folder / of_sensor("camera", self.sensor, ".json")
         if not file.exists():
             return None, None
         try:
             entry = Entry(file, "", read_json(file))
-            fx, fy, cx, cy = (entry.number(key) for key in ("fx", "fy", "cx", "cy"))
-            try:
-                return Camera(fx, fy, cx, cy, entry.integer("width"), entry.integer("height")), None
-            except BopFault:
-                raise
-            except InputError as error:
-                raise entry.fault(str(error)) from None
+            intrinsics = {key: entry.number(key) for key in ("fx", "fy", "cx", "cy")}
+            size = {key: entry.integer(key) for key in ("width", "height")}
+            return entry.make(Camera, **intrinsics, **size), None
         except BopFault as fault:
             return None, fault
-
-
-def _problem(fault: BopFault, scene_id: int | None = None, image_id: int | None = None) -> Problem:
-    return Problem(fault.file, fault.entry, fault.what, scene_id, image_id)
-
-
-def _scene_folders(folder: Path) -> dict[int, Path]:
-    return {int(path.name): path for path in reversed(_numbered(folder))}
 
 
 def _numbered(folder: Path) -> list[Path]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import io
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Shaped, UInt16
@@ -17,18 +17,28 @@ from kmn_jax.errors import InputError
 from kmn_jax.units import METRES, check_unit
 
 SATURATED = 65535  # a 16-bit depth that did not fit, such as the background of BlenderProc: not a measurement
+_T = TypeVar("_T")
 _DEPTH_MODES = ("I;16", "I;16L", "I;16B", "I", "F")
 
 
 class BopFault(InputError):
-    """A part of a dataset that cannot be used: a file, the entry in it ("" for all of it), and what is wrong."""
+    """A part of a dataset that cannot be used: a file, the entry in it ("" for all of it), and what is wrong.
 
-    def __init__(self, file: Path, entry: str, what: str) -> None:
-        super().__init__(file, entry, what)
-        self.file, self.entry, self.what = file, entry, what
+    The ids are those of the frame, `image_id` None for all of a scene, both None for what concerns neither.
+    """
+
+    def __init__(
+        self, file: Path, entry: str, what: str, scene_id: int | None = None, image_id: int | None = None
+    ) -> None:
+        super().__init__(file, entry, what, scene_id, image_id)
+        self.file, self.entry, self.what, self.scene_id, self.image_id = file, entry, what, scene_id, image_id
 
     def __str__(self) -> str:
         return f"{self.file}: {self.entry}: {self.what}" if self.entry else f"{self.file} {self.what}"
+
+    def of_frame(self, scene_id: int, image_id: int | None = None) -> BopFault:
+        """Return the fault as that of a frame, or of a whole scene."""
+        return BopFault(self.file, self.entry, self.what, scene_id, image_id)
 
 
 @dataclass(frozen=True)
@@ -46,6 +56,13 @@ class Entry:
     def fault(self, what: str) -> BopFault:
         """Return what is wrong with this entry, to be raised."""
         return BopFault(self.file, self.name, what)
+
+    def make(self, kind: Callable[..., _T], *values: Any, **named: Any) -> _T:
+        """Return what `kind` makes of values of this entry; an InputError becomes a fault of the entry."""
+        try:
+            return kind(*values, **named)
+        except InputError as error:
+            raise self.fault(str(error)) from None
 
     def numbers(self, key: str, count: int) -> Float[np.ndarray, " count"]:
         """Return a list of exactly `count` finite numbers."""
@@ -66,12 +83,15 @@ class Entry:
             raise self.fault(f"{key} is {number:g}, but must be a whole number")
         return int(number)
 
-    def pose(self, rotation: str, translation: str, factor: float) -> Float[np.ndarray, "4 4"]:
-        """Return the pose of a row-wise rotation and a translation, whose lengths are multiplied by `factor`."""
+    def pose(self, frames: str, factor: float) -> Float[np.ndarray, "4 4"]:
+        """Return the pose under the names of `pose_keys`, its lengths multiplied by `factor`."""
+        rotation, translation = pose_keys(frames)
         pose = np.eye(4)
         pose[:3, :3] = self.numbers(rotation, 9).reshape(3, 3)
         pose[:3, 3] = self.numbers(translation, 3) * factor
-        if not is_rotation(pose[:3, :3]):
+        with np.errstate(over="ignore", invalid="ignore"):
+            product, determinant = pose[:3, :3].T @ pose[:3, :3], np.linalg.det(pose[:3, :3])
+        if not np.allclose(product, np.eye(3), rtol=0, atol=5e-3) or not determinant > 0:
             raise self.fault(f"{rotation} is not a rotation: its rows must be orthonormal and right-handed")
         return pose
 
@@ -88,10 +108,21 @@ class Entry:
         return float(value)
 
 
-def is_rotation(matrix: Float[np.ndarray, "3 3"]) -> bool:
-    """Tell whether a matrix is a proper rotation, to the digits that pose files carry."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return bool(np.allclose(matrix.T @ matrix, np.eye(3), rtol=0, atol=5e-3) and np.linalg.det(matrix) > 0)
+def pose_keys(frames: str) -> tuple[str, str]:
+    """Return the names of a pose's row-wise rotation and its translation, such as those from "m2c", model to camera."""
+    return f"cam_R_{frames}", f"cam_t_{frames}"
+
+
+def pose_entry(frames: str, pose: Float[np.ndarray, "4 4"], factor: float) -> dict[str, list[float]]:
+    """Return a pose, its lengths multiplied by `factor`, under the names of `pose_keys`: what `Entry.pose` reads."""
+    rotation, translation = pose_keys(frames)
+    pose = pose.astype(np.float64)
+    return {rotation: pose[:3, :3].ravel().tolist(), translation: (pose[:3, 3] * factor).tolist()}
+
+
+def of_sensor(name: str, sensor: str | None, suffix: str = "") -> str:
+    """Return the name of a file or folder, one of those of a sensor if the scene has several."""
+    return f"{name}_{sensor}{suffix}" if sensor else f"{name}{suffix}"
 
 
 def millimetres(unit: str) -> float:
@@ -185,7 +216,7 @@ def pixels(file: Path) -> Shaped[np.ndarray, "..."]:
 def _open_image(file: Path, decode: bool) -> tuple[str, str | None, tuple[int, int], np.ndarray]:
     from PIL import Image
 
-    content: Path | io.BytesIO = io.BytesIO(_content(file)) if decode else _checked_file(file)
+    content: Path | io.BytesIO = io.BytesIO(_content(file)) if decode else checked_file(file)
     try:
         with Image.open(content) as image:
             values = np.asarray(image) if decode else np.zeros((0, 0))
@@ -196,12 +227,13 @@ def _open_image(file: Path, decode: bool) -> tuple[str, str | None, tuple[int, i
 
 def _content(file: Path) -> bytes:
     try:
-        return _checked_file(file).read_bytes()
+        return checked_file(file).read_bytes()
     except OSError as error:
         raise BopFault(file, "", f"cannot be read: {error.strerror}") from None
 
 
-def _checked_file(file: Path) -> Path:
+def checked_file(file: Path) -> Path:
+    """Return the path of a file that is there and not empty."""
     try:
         size = file.stat().st_size
     except FileNotFoundError:

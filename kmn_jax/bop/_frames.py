@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
-from kmn_jax.bop._files import BopFault, Entry
+from kmn_jax.bop._files import Entry, pose_entry, pose_keys
 from kmn_jax.errors import InputError
-from kmn_jax.geometry import Camera, depth_to_points
+from kmn_jax.geometry import Camera
 from kmn_jax.simulate import Bin, BinScene
 
 Box: TypeAlias = tuple[int, int, int, int]  # left, top, width, height in pixels; a silhouette may leave the image
@@ -66,10 +66,6 @@ class BopFrame:
                     " one image for each instance"
                 )
 
-    def points(self) -> Float[Array, "h w 3"]:
-        """Return the points of the depth image in the camera frame; the zero point where nothing was measured."""
-        return depth_to_points(jnp.asarray(self.depth, jnp.float32), jnp.asarray(self.camera.matrix, jnp.float32))
-
     def with_visibility(self) -> BopFrame:
         """Return the frame with the boxes, counts and fractions that its masks tell and its instances lack."""
         if self.instances is None or (self.masks is None and self.visible_masks is None):
@@ -97,46 +93,30 @@ def scene_frame(
     object_id: int,
     depth: Float[np.ndarray, "h w"],
     instances: Int[np.ndarray, "h w"],
-    total_pixels: Int[np.ndarray, " n"] | None = None,
-    total_boxes: Int[np.ndarray, "n 4"] | None = None,
+    total_pixels: Int[np.ndarray, " n"],
+    total_boxes: Int[np.ndarray, "n 4"],
 ) -> BopFrame:
     """Return the frame of a rendered bin: `instances` holds the number of the copy that each pixel shows.
 
-    `total_pixels` and `total_boxes` are the size and the box of each copy's silhouette, without what hides it; unless
-    they are given, the visible fractions stay unknown. The depth may be that of a sensor.
+    `total_pixels` and `total_boxes` are the size and the box of each copy's silhouette, without what hides it. The
+    depth may be that of a sensor.
     """
-    poses = scene.T_camera_object
     placed = []
-    for index, pose in enumerate(poses):
-        count = None if total_pixels is None else int(total_pixels[index])
-        box = None
-        if total_boxes is not None and count != 0:
-            left, top, width, height = total_boxes[index].tolist()
-            box = (left, top, width, height)
-        placed.append(BopInstance(object_id, pose, box=box, num_pixels=count))
-    visible = instances[None] == np.arange(len(poses))[:, None, None]
+    for pose, count, box in zip(scene.T_camera_object, total_pixels.tolist(), total_boxes.tolist(), strict=True):
+        placed.append(BopInstance(object_id, pose, box=tuple(box) if count else None, num_pixels=count))
+    visible = instances[None] == np.arange(len(placed))[:, None, None]
     frame = BopFrame(
         scene.camera, depth, tuple(placed), bin=scene.bin, T_camera_bin=scene.T_camera_bin, visible_masks=visible
     )
     return frame.with_visibility()
 
 
-@dataclass(frozen=True)
-class CameraEntry:
+class CameraEntry(NamedTuple):
     """An image's entry in scene_camera.json; its image tells the size."""
 
-    entry: Entry
     matrix: Float[np.ndarray, "3 3"]
     depth_scale: float  # mm of one step
     T_camera_world: Float[np.ndarray, "4 4"] | None
-
-    def camera(self, width: int, height: int) -> Camera:
-        """Return the camera of an image of that size."""
-        (fx, _, cx), (_, fy, cy), _ = self.matrix.tolist()
-        try:
-            return Camera(fx, fy, cx, cy, width, height)
-        except InputError as error:
-            raise self.entry.fault(str(error)) from None
 
 
 def parse_camera(entry: Entry, factor: float) -> CameraEntry:
@@ -149,82 +129,63 @@ def parse_camera(entry: Entry, factor: float) -> CameraEntry:
     depth_scale = entry.number("depth_scale")
     if depth_scale <= 0:
         raise entry.fault(f"depth_scale is {depth_scale:g}, but must be above zero: it is the mm of one step")
-    has_world = "cam_R_w2c" in entry.values or "cam_t_w2c" in entry.values
-    T_camera_world = entry.pose("cam_R_w2c", "cam_t_w2c", factor) if has_world else None
-    return CameraEntry(entry, matrix, depth_scale, T_camera_world)
+    has_world = any(key in entry.values for key in pose_keys("w2c"))
+    return CameraEntry(matrix, depth_scale, entry.pose("w2c", factor) if has_world else None)
 
 
 def format_camera(frame: BopFrame, depth_scale: float, factor: float) -> dict[str, Any]:
     """Return a frame's entry of scene_camera.json; `factor` turns its lengths into millimetres."""
-    result: dict[str, Any] = {"cam_K": frame.camera.matrix.ravel().tolist(), "depth_scale": depth_scale}
-    if frame.T_camera_world is not None:
-        result |= format_pose(frame.T_camera_world, "cam_R_w2c", "cam_t_w2c", factor)
-    return result
+    world = {} if frame.T_camera_world is None else pose_entry("w2c", frame.T_camera_world, factor)
+    return {"cam_K": frame.camera.matrix.ravel().tolist(), "depth_scale": depth_scale, **world}
 
 
 def parse_instance(truth: Entry, info: Entry | None, factor: float) -> BopInstance:
     """Read an instance from its entries in scene_gt.json and, if there is one, scene_gt_info.json."""
-    pose = truth.pose("cam_R_m2c", "cam_t_m2c", factor)
-    instance = BopInstance(truth.integer("obj_id"), pose)
+    instance = BopInstance(truth.integer("obj_id"), truth.pose("m2c", factor))
     if info is None:
         return instance
-    found: dict[str, Any] = {}
-    for name, key in (("box", "bbox_obj"), ("visible_box", "bbox_visib")):
-        if key in info.values:
-            numbers = tuple(int(number) for number in info.numbers(key, 4))
-            found[name] = None if numbers == _NO_BOX else numbers
-    for name, key in _COUNTS.items():
-        if key in info.values:
-            found[name] = info.integer(key)
-    if "visib_fract" in info.values:
-        found["visible_fraction"] = info.number("visib_fract")
-    try:
-        return replace(instance, **found)
-    except InputError as error:
-        raise info.fault(f"visib_fract: {error}") from None
+    found = {name: read(info, key) for name, (key, read) in _VISIBILITY.items() if key in info.values}
+    return info.make(replace, instance, **found)
 
 
 def format_instance(instance: BopInstance, factor: float) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return an instance's entries of scene_gt.json and of scene_gt_info.json, the latter with what is known."""
-    truth = {"obj_id": instance.object_id, **format_pose(instance.T_camera_object, "cam_R_m2c", "cam_t_m2c", factor)}
-    info: dict[str, Any] = {key: getattr(instance, name) for name, key in _COUNTS.items()}
-    info["visib_fract"] = instance.visible_fraction
-    info["bbox_obj"] = _format_box(instance.box, instance.num_pixels)
-    info["bbox_visib"] = _format_box(instance.visible_box, instance.num_visible_pixels)
-    return truth, {key: value for key, value in info.items() if value is not None}
+    known = {key: getattr(instance, name) for name, (key, _) in _VISIBILITY.items()}
+    for box, count in (("bbox_obj", "px_count_all"), ("bbox_visib", "px_count_visib")):
+        if known[box] is None and known[count] == 0:
+            known[box] = _NO_BOX
+    info = {key: np.asarray(value).tolist() for key, value in known.items() if value is not None}
+    return {"obj_id": instance.object_id, **pose_entry("m2c", instance.T_camera_object, factor)}, info
 
 
 def parse_bin(entry: Entry, factor: float) -> tuple[Bin, Float[np.ndarray, "4 4"]]:
     """Read the bin and T_camera_bin of an image from scene_bin.json, a file of ours beside those of BOP."""
-    pose = entry.pose("cam_R_b2c", "cam_t_b2c", factor)
-    try:
-        return Bin(*(entry.number(key) * factor for key in ("length", "width", "height", "thickness"))), pose
-    except BopFault:
-        raise
-    except InputError as error:
-        raise entry.fault(str(error)) from None
+    pose = entry.pose("b2c", factor)
+    return entry.make(Bin, *(entry.number(key) * factor for key in _BIN)), pose
 
 
-def format_bin(frame: BopFrame, factor: float) -> dict[str, float | list[float]] | None:
+def format_bin(frame: BopFrame, factor: float) -> dict[str, Any] | None:
     """Return a frame's entry of scene_bin.json in millimetres, None without a bin."""
     if frame.bin is None or frame.T_camera_bin is None:
         return None
-    sizes = {key: float(getattr(frame.bin, key) * factor) for key in ("length", "width", "height", "thickness")}
-    return {**sizes, **format_pose(frame.T_camera_bin, "cam_R_b2c", "cam_t_b2c", factor)}
+    sizes = {key: float(getattr(frame.bin, key) * factor) for key in _BIN}
+    return {**sizes, **pose_entry("b2c", frame.T_camera_bin, factor)}
 
 
-def format_pose(
-    T_target_source: Float[np.ndarray, "4 4"], rotation: str, translation: str, factor: float
-) -> dict[str, list[float]]:
-    """Return a pose as a row-wise rotation and a translation in millimetres, under the given names."""
-    pose = T_target_source.astype(np.float64)
-    return {rotation: pose[:3, :3].ravel().tolist(), translation: (pose[:3, 3] * factor).tolist()}
+def _read_box(entry: Entry, key: str) -> Box | None:
+    left, top, width, height = (int(number) for number in entry.numbers(key, 4))
+    return None if (left, top, width, height) == _NO_BOX else (left, top, width, height)
 
 
-_COUNTS = {
-    "num_pixels": "px_count_all",
-    "num_valid_pixels": "px_count_valid",
-    "num_visible_pixels": "px_count_visib",
+_BIN = ("length", "width", "height", "thickness")
+# Of scene_gt_info.json: what an instance calls it, its key, and how to read it.
+_VISIBILITY: dict[str, tuple[str, Callable[[Entry, str], Any]]] = {
+    "visible_fraction": ("visib_fract", Entry.number),
+    "box": ("bbox_obj", _read_box),
+    "visible_box": ("bbox_visib", _read_box),
+    "num_pixels": ("px_count_all", Entry.integer),
+    "num_valid_pixels": ("px_count_valid", Entry.integer),
+    "num_visible_pixels": ("px_count_visib", Entry.integer),
 }
 
 
@@ -234,9 +195,3 @@ def _box(mask: Bool[np.ndarray, "h w"]) -> Box | None:
         return None
     left, top = int(columns[0]), int(rows[0])
     return left, top, int(columns[-1]) - left + 1, int(rows[-1]) - top + 1
-
-
-def _format_box(box: Box | None, num_pixels: int | None) -> list[int] | None:
-    if box is None:
-        return list(_NO_BOX) if num_pixels == 0 else None
-    return [int(number) for number in box]

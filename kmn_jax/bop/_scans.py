@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kmn_jax.bop._files import millimetres
+from kmn_jax.bop._files import millimetres, of_sensor
 from kmn_jax.bop._frames import BopInstance
 from kmn_jax.bop._models import read_models
 from kmn_jax.bop._reader import FrameReader, Scene
@@ -30,20 +30,18 @@ def bop_scan(path: str | Path, unit: str = "mm") -> tuple[Scan, tuple[BopInstanc
     of it is missing or broken, or if nothing in it was measured.
     """
     path = Path(path)
-    factor = 1 / millimetres(unit)
-    place = _scene_of(path)
+    factor, place = 1 / millimetres(unit), _scene_of(path)
     if place is None:
         raise InputError(
             f"{path} is not a depth image of a BOP scene: those lie in SCENE/depth/, beside SCENE/scene_camera.json"
         )
     folder, sensor = place
-    has_truth = (folder / _named("scene_gt", sensor)).exists()
-    scene = Scene(folder, sensor, ground_truth=has_truth)
-    reader = FrameReader(scene, int(path.stem), factor, object_ids=None, sensor=None)
-    read = scene.depth_files.get(int(path.stem))
-    if read is not None and read.name != path.name:
-        raise InputError(f"{path} and {read.name} are both image {int(path.stem)} of their scene: remove one of them")
-    frame = reader.frame(with_masks=False)
+    scene = Scene(folder, sensor, ground_truth=(folder / of_sensor("scene_gt", sensor, ".json")).exists())
+    reader = FrameReader(scene, int(path.stem), factor)
+    if reader.depth_file.name != path.name and reader.depth_file.exists():
+        other = f"{path} and {reader.depth_file.name} are both image {int(path.stem)} of their scene"
+        raise InputError(f"{other}: remove one of them")
+    frame = reader.read(masks=False)
     faults = [*scene.faults, *reader.faults]
     if faults or frame is None:
         raise InputError(f"{path} cannot be used: {faults[0]}")
@@ -81,8 +79,4 @@ def _scene_of(path: Path) -> tuple[Path, str | None] | None:
     if kind != "depth" or path.suffix.lower() not in _SUFFIXES or not (path.stem.isascii() and path.stem.isdigit()):
         return None
     folder = path.parent.parent
-    return (folder, sensor or None) if (folder / _named("scene_camera", sensor or None)).is_file() else None
-
-
-def _named(name: str, sensor: str | None) -> str:
-    return f"{name}_{sensor}.json" if sensor else f"{name}.json"
+    return (folder, sensor or None) if (folder / of_sensor("scene_camera", sensor, ".json")).is_file() else None

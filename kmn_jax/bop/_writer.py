@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import math
 import os
 import shutil
@@ -14,9 +15,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt16
 
-from kmn_jax.bop._files import SATURATED, is_rotation, json_by_id, millimetres, pixels, png_bytes
+from kmn_jax.bop._files import SATURATED, json_by_id, millimetres, pixels, png_bytes
 from kmn_jax.bop._frames import BopFrame, format_bin, format_camera, format_instance
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, rigid_pose
 from kmn_jax.files import write_whole
 from kmn_jax.geometry import Camera
 
@@ -35,12 +36,10 @@ def finest_depth_scale(farthest: float, unit: str) -> float:
 
 def write_camera(folder: str | Path, camera: Camera, depth_scale: float) -> None:
     """Write camera.json, the sensor that scenes share."""
-    names = ("cx", "cy", "fx", "fy", "height", "width")
-    values = {name: getattr(camera, name) for name in names} | {"depth_scale": depth_scale}
-    lines = [
-        f'  "{name}": {float(value) if name[0] in "cdf" else int(value)}' for name, value in sorted(values.items())
-    ]
-    write_whole(Path(folder) / "camera.json", ("{\n" + ",\n".join(lines) + "\n}\n").encode())
+    values = {key: float(getattr(camera, key)) for key in ("fx", "fy", "cx", "cy")}
+    sizes = {"width": int(camera.width), "height": int(camera.height)}
+    content = json.dumps({**values, **sizes, "depth_scale": float(depth_scale)}, indent=2, sort_keys=True)
+    write_whole(Path(folder) / "camera.json", f"{content}\n".encode())
 
 
 def write_scene(
@@ -115,9 +114,10 @@ def _write_frame(scene: Path, image_id: int, frame: BopFrame, factor: float, dep
     for index, instance in enumerate(frame.instances):
         if instance.object_id < 1:
             raise InputError(f"instance {index}: object_id is {instance.object_id}, but must be 1 or more")
-        _check_pose(instance.T_camera_object, f"instance {index}: T_camera_object")
-    _check_pose(frame.T_camera_world, "T_camera_world")
-    _check_pose(frame.T_camera_bin, "T_camera_bin")
+        rigid_pose(instance.T_camera_object, f"instance {index}: T_camera_object")
+    for name, pose in (("T_camera_world", frame.T_camera_world), ("T_camera_bin", frame.T_camera_bin)):
+        if pose is not None:
+            rigid_pose(pose, name)
     (scene / "depth" / f"{image_id:06d}.png").write_bytes(png_bytes(_depth_steps(frame.depth, factor, depth_scale)))
     formatted = [format_instance(instance, factor) for instance in frame.with_visibility().instances or ()]
     entries: dict[str, Any] = {
@@ -146,12 +146,3 @@ def _depth_steps(depth: Float[np.ndarray, "h w"], factor: float, depth_scale: fl
             f" of {depth_scale:g} mm can store {depth_scale:g} to {(SATURATED - 1) * depth_scale:g} mm: choose another"
         )
     return steps.astype(np.uint16)
-
-
-def _check_pose(pose: Float[np.ndarray, "4 4"] | None, name: str) -> None:
-    if pose is None:
-        return
-    if not np.isfinite(pose).all():
-        raise InputError(f"{name} holds NaN or infinity")
-    if not is_rotation(pose[:3, :3].astype(np.float64)) or pose[3].tolist() != [0, 0, 0, 1]:
-        raise InputError(f"{name} is not rigid: it needs a rotation and a last row 0 0 0 1")

@@ -70,24 +70,7 @@ DIRECTIONS = _fibonacci_sphere(256)  # cuts are compared on the outermost points
 def collision_shape(
     vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], config: HullConfig = HullConfig()
 ) -> CollisionShape:
-    """Return the convex parts of a surface and the mass properties of their union, for `settle`.
-
-    Raises:
-        InputError: the surface is empty, not finite, or flat.
-    """
-    parts = collision_hulls(vertices, triangles, config)
-    corners = np.asarray(vertices, dtype=np.float64)[np.unique(triangles)]
-    diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
-    volume, center, inertia = _mass_properties(parts)
-    moments, axes = np.linalg.eigh(inertia)
-    axes[:, 2] *= np.sign(np.linalg.det(axes))
-    return CollisionShape(tuple(parts), diagonal, volume, center, axes, moments / volume)
-
-
-def collision_hulls(
-    vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], config: HullConfig = HullConfig()
-) -> list[Float[np.ndarray, "_ 3"]]:
-    """Cut a surface along its frame's axes where that empties most volume; return the corners of the parts' hulls.
+    """Cut a surface along its frame's axes where that empties most volume; return the parts' hulls, for `settle`.
 
     The surface need be neither closed nor consistently wound: the parts cover all of it, holes and recesses too where
     no cut opens them. The result is deterministic.
@@ -95,7 +78,7 @@ def collision_hulls(
     Raises:
         InputError: the surface is empty, not finite, or flat.
     """
-    corners = _triangle_corners(vertices, triangles)
+    corners = triangle_corners(vertices, triangles)
     low = corners.min(axis=(0, 1))
     diagonal = float(np.linalg.norm(corners.max(axis=(0, 1)) - low))
     unit = (corners - low) / (diagonal or 1.0)
@@ -113,18 +96,25 @@ def collision_hulls(
             break
         pieces[best : best + 1] = halves
         cuts[best : best + 1] = [_best_cut(half, whole, config) for half in halves]
-    return [_hull_corners(piece.triangles) * diagonal + low for piece in pieces]
+    parts = tuple(_hull_corners(piece.triangles) * diagonal + low for piece in pieces)
+    volume, center, inertia = _mass_properties(parts)
+    moments, axes = np.linalg.eigh(inertia)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    return CollisionShape(parts, diagonal, volume, center, axes, moments / volume)
 
 
-def _triangle_corners(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def triangle_corners(
+    vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]
+) -> Float[np.ndarray, "t 3 3"]:
+    """Return the corners of a surface's triangles; raise InputError for one that is empty or not finite."""
     vertices, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(triangles)
     if len(triangles) == 0 or len(vertices) == 0:
-        raise InputError("the surface has no triangles: there is nothing to collide with")
+        raise InputError("the surface has no triangles: there is nothing to see or to collide with")
     if triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise InputError(f"triangles refer to vertices {triangles.min()} to {triangles.max()} of {len(vertices)}")
+        raise InputError(f"triangles name vertices from {triangles.min()} to {triangles.max()} of {len(vertices)}")
     corners = vertices[triangles]
     if not np.isfinite(corners).all():
-        raise InputError("the surface has vertices that are NaN or infinite: repair the mesh first")
+        raise InputError("the surface has vertices that are NaN or infinite: export the part again")
     return corners
 
 

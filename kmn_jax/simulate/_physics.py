@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,18 +70,15 @@ class BinConfig:
 class DropResult:
     """What became of a drop. Poses and bin are in the object's unit, and of the last attempt where none was accepted.
 
-    `penetration` is the deepest contact and `speed` that of the fastest copy, in diagonals (a second); `rotation` is in
-    radians per second. `capped` means not at rest when the time was over. `floor_share` of the copies touch the floor.
-    `rejected` says why each attempt was not used. There are no poses where not even dropping was possible.
+    `penetration` is the deepest contact, in diagonals. `capped` means not at rest when the time was over. `floor_share`
+    of the copies touch the floor. `rejected` says why each attempt was not used. There are no poses where not even
+    dropping was possible.
     """
 
     accepted: bool
     T_bin_object: Float[np.ndarray, "n 4 4"]
     bin: Bin
     penetration: float
-    speed: float
-    rotation: float
-    simulated_time: float
     capped: bool
     floor_share: float
     attempts: int
@@ -91,21 +87,16 @@ class DropResult:
 
 @dataclass(frozen=True)
 class _Rest:
-    """The end of one simulation, in simulated metres."""
+    """The end of one simulation, in simulated metres, and why it cannot be used; empty if it can."""
 
     T_bin_body: np.ndarray
+    faults: str
     penetration: float = 0.0
-    speed: float = 0.0
-    rotation: float = 0.0
-    time: float = 0.0
     capped: bool = False
     floor_share: float = 0.0
-    above_rim: bool = False
-    in_air: bool = False
-    warnings: str = ""
 
 
-def settle(shape: CollisionShape, copies: int, config: BinConfig, seed: int | Sequence[int]) -> DropResult:
+def settle(shape: CollisionShape, copies: int, config: BinConfig, random_seed: int | Sequence[int]) -> DropResult:
     """Drop copies of an object into a bin and let them come to rest.
 
     The same arguments give the same bits on one machine. That nothing could be accepted is told by the result, never by
@@ -114,49 +105,42 @@ def settle(shape: CollisionShape, copies: int, config: BinConfig, seed: int | Se
     Args:
         shape: collision shape of the object, see `collision_shape`.
         copies: how many, 1 or more.
-        seed: one number or several, 0 or more, such as those of the run, of the object and of the drop.
+        random_seed: one number or several, 0 or more, such as those of the run, of the object and of the drop.
 
     Raises:
-        InputError: there are no copies, a seed is negative, or the shape has no volume.
+        InputError: there are no copies, or a random seed is negative.
     """
     if copies < 1:
         raise InputError(f"copies is {copies}, but a bin needs 1 or more")
-    if np.min(seed, initial=0) < 0:
-        raise InputError(f"seed is {seed}, but must be 0 or more")
-    if not (0 < shape.diagonal < math.inf and 0 < shape.volume < math.inf):
-        raise InputError(
-            f"the collision shape has diagonal {shape.diagonal} and volume {shape.volume}: both must be > 0"
-        )
-    rng = np.random.default_rng(seed)
+    if np.min(random_seed, initial=0) < 0:
+        raise InputError(f"random_seed is {random_seed}, but must be 0 or more")
+    rng = np.random.default_rng(random_seed)
     body = _Body(shape)
-    least, most = _bin_scales(shape, copies, config)
+    room = config.packing * config.length * config.width * config.height[0] * shape.diagonal**3
+    most = config.scale[1]
+    least = min(max(config.scale[0], math.sqrt(copies * shape.volume / room)), most)
     rejected: list[str] = []
-    accepted = False
-    while not accepted and len(rejected) < config.attempts:
+    for _ in range(config.attempts):
         scale = rng.uniform(least, most)
         size = np.array([config.length * scale, config.width * scale, rng.uniform(*config.height)]) * SIMULATED_DIAGONAL
         spawned = _spawn(body, copies, size, rng)
         if spawned is None or copies * body.volume > size.prod():
-            rest, faults = _Rest(np.zeros((0, 4, 4))), "the bin is too small for the copies"
+            rest = _Rest(np.zeros((0, 4, 4)), "the bin is too small for the copies")
         else:
             rest = _simulate(body, spawned, size, config)
-            faults = _faults(body, rest, size, config)
-        accepted = not faults
-        if faults:
-            rejected.append(faults)
-            least = min(max(least, 1.1 * scale), most)  # most faults are those of a bin that is too full
+        if not rest.faults:
+            break
+        rejected.append(rest.faults)
+        least = min(max(least, 1.1 * scale), most)  # most faults are those of a bin that is too full
     length, width, height = (float(value) for value in size / body.scale)
     return DropResult(
-        accepted=accepted,
+        accepted=not rest.faults,
         T_bin_object=body.to_object(rest.T_bin_body),
         bin=Bin(length, width, height, config.thickness * shape.diagonal),
         penetration=rest.penetration / SIMULATED_DIAGONAL,
-        speed=rest.speed / SIMULATED_DIAGONAL,
-        rotation=rest.rotation,
-        simulated_time=rest.time,
         capped=rest.capped,
         floor_share=rest.floor_share,
-        attempts=len(rejected) + accepted,
+        attempts=len(rejected) + (not rest.faults),
         rejected=tuple(rejected),
     )
 
@@ -180,13 +164,6 @@ class _Body:
         T_bin_object[:, :3, :3] = rotation
         T_bin_object[:, :3, 3] = T_bin_body[:, :3, 3] / self.scale - rotation @ self.shape.center
         return T_bin_object
-
-
-def _bin_scales(shape: CollisionShape, copies: int, config: BinConfig) -> tuple[float, float]:
-    """Return the range of scales whose bins hold the copies; the largest scale where none does."""
-    room = config.packing * config.length * config.width * config.height[0] * shape.diagonal**3
-    least = math.sqrt(copies * shape.volume / room)
-    return min(max(config.scale[0], least), config.scale[1]), config.scale[1]
 
 
 def _spawn(body: _Body, copies: int, size: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
@@ -265,15 +242,20 @@ def _simulate(body: _Body, T_bin_body: np.ndarray, size: np.ndarray, config: Bin
     try:
         model = _model(body, copies, size, config)
     except ValueError as error:
-        return _Rest(T_bin_body, warnings=f"mujoco refuses the shape: {error}")
+        return _Rest(T_bin_body, f"mujoco refuses the shape: {error}")
     data = mujoco.MjData(model)
     quaternions = Rotation.from_matrix(T_bin_body[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
     data.qpos[:] = np.concatenate([T_bin_body[:, :3, 3], quaternions], axis=1).ravel()
     steps = round(config.check_every / config.step)
     checks, calm = max(1, round(config.time_cap / config.check_every)), 0
+    # Lest mujoco writes a log file into the working directory; its warnings are counted in the data.
+    previous = mujoco.get_mju_user_warning()
     for _ in range(checks):
-        with _warnings_unprinted():
+        mujoco.set_mju_user_warning(lambda message: None)
+        try:
             mujoco.mj_step(model, data, nstep=steps)
+        finally:
+            mujoco.set_mju_user_warning(previous)
         if data.warning.number.any():
             break
         speed, rotation = np.linalg.norm(data.qvel.reshape(copies, 2, 3), axis=2).max(axis=0)
@@ -284,54 +266,26 @@ def _simulate(body: _Body, T_bin_body: np.ndarray, size: np.ndarray, config: Bin
     warned = np.flatnonzero(data.warning.number)
     if warned.size:
         names = ", ".join(mujoco.mjtWarning(int(kind)).name for kind in warned)
-        return _Rest(T_bin_body, time=float(data.time), warnings=f"the simulation broke down: {names}")
+        return _Rest(T_bin_body, f"the simulation broke down: {names}")
     mujoco.mj_forward(model, data)  # contacts of the last pose
     poses = np.tile(np.eye(4), (copies, 1, 1))
     poses[:, :3, 3] = data.xpos[1:]
     poses[:, :3, :3] = data.xmat[1:].reshape(copies, 3, 3)
+    penetration = max(0.0, -float(data.contact.dist.min(initial=0.0)))
     geoms = data.contact.geom
     touching = model.geom_bodyid[geoms]
     on_floor = touching[(geoms == 0).any(axis=1)]
     on_wall = ((geoms > 0) & (geoms <= len(WALLS))).any(axis=1)
-    return _Rest(
-        T_bin_body=poses,
-        penetration=max(0.0, -float(data.contact.dist.min(initial=0.0))),
-        speed=float(speed),
-        rotation=float(rotation),
-        time=float(data.time),
-        capped=calm < config.rest_checks,
-        floor_share=len(np.unique(on_floor[on_floor > 0])) / copies,
-        above_rim=bool((data.contact.pos[on_wall, 2] > size[2]).any()),
-        in_air=len(np.unique(touching[touching > 0])) < copies,
-    )
-
-
-@contextmanager
-def _warnings_unprinted() -> Iterator[None]:
-    """Keep mujoco from writing a log file into the working directory; its warnings are counted in the data."""
-    import mujoco
-
-    previous = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(previous)
-
-
-def _faults(body: _Body, rest: _Rest, size: np.ndarray, config: BinConfig) -> str:
-    """Return why a scene cannot be used; empty if it can."""
-    if rest.warnings:
-        return rest.warnings
-    faults = []
-    if rest.penetration > config.penetration * SIMULATED_DIAGONAL:
-        faults.append(f"copies penetrate by {rest.penetration / SIMULATED_DIAGONAL:.2%} of the diagonal")
-    corners = np.einsum("nij,vj->nvi", rest.T_bin_body[:, :3, :3], body.corners) + rest.T_bin_body[:, None, :3, 3]
+    corners = np.einsum("nij,vj->nvi", poses[:, :3, :3], body.corners) + poses[:, None, :3, 3]
     beyond = float(max((np.abs(corners[..., :2]) - size[:2] / 2).max(), -corners[..., 2].min()))
-    if beyond > config.penetration * SIMULATED_DIAGONAL:
+    faults, most = [], config.penetration * SIMULATED_DIAGONAL
+    if penetration > most:
+        faults.append(f"copies penetrate by {penetration / SIMULATED_DIAGONAL:.2%} of the diagonal")
+    if beyond > most:
         faults.append(f"a copy reaches {beyond / SIMULATED_DIAGONAL:.2%} of the diagonal into a wall or the floor")
-    if rest.above_rim:
+    if (data.contact.pos[on_wall, 2] > size[2]).any():
         faults.append("a copy leans on the wall above the rim")
-    if rest.in_air:
+    if len(np.unique(touching[touching > 0])) < copies:
         faults.append("a copy touches nothing")
-    return ", ".join(faults)
+    floor_share = len(np.unique(on_floor[on_floor > 0])) / copies
+    return _Rest(poses, ", ".join(faults), penetration, calm < config.rest_checks, floor_share)

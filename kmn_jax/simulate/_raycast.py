@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, rigid_pose
 from kmn_jax.geometry import Camera
 from kmn_jax.simulate._bin_scene import Bin, BinScene
+from kmn_jax.simulate._hulls import triangle_corners
 
 # Int16 coordinates put a surfel up to 1.3e-5 diagonals off its surface, float32 a ray's hit up to 1e-5 at 20 diagonals:
 # ten times that, and still less than any step of a part that a camera resolves.
@@ -29,17 +30,7 @@ class RayMesh:
     def __init__(self, vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]) -> None:
         import open3d
 
-        if len(triangles) == 0:
-            raise InputError("the mesh has no triangles: there is nothing to render")
-        if triangles.min() < 0 or triangles.max() >= len(vertices):
-            raise InputError(
-                f"the mesh's triangles name vertices from {triangles.min()} to {triangles.max()}, but it has"
-                f" {len(vertices)}"
-            )
-        corners = vertices[np.unique(triangles)].astype(np.float64)
-        if not np.isfinite(corners).all():
-            bad = int((~np.isfinite(corners)).any(axis=1).sum())
-            raise InputError(f"{bad} of the mesh's {len(corners)} vertices are NaN or infinite: export the part again")
+        corners = triangle_corners(vertices, triangles).reshape(-1, 3)
         self.minimum: Float[np.ndarray, "3"] = corners.min(axis=0)
         self.maximum: Float[np.ndarray, "3"] = corners.max(axis=0)
         self.center: Float[np.ndarray, "3"] = (self.minimum + self.maximum) / 2
@@ -107,7 +98,6 @@ class Rendering:
     visible_pixels: Int[np.ndarray, " n"]
     total_pixels: Int[np.ndarray, " n"]
     total_boxes: Int[np.ndarray, "n 4"]
-    include_bin: bool
 
     @property
     def visible_fraction(self) -> Float[np.ndarray, " n"]:
@@ -115,13 +105,8 @@ class Rendering:
         return self.visible_pixels / np.maximum(self.total_pixels, 1)
 
 
-def bin_mesh(bin: Bin) -> RayMesh:
-    """Return the surface of a bin: floor and four walls of its thickness, open above, with flat rims."""
-    return RayMesh(*bin_triangles(bin))
-
-
 def bin_triangles(bin: Bin) -> tuple[Float[np.ndarray, "16 3"], Int[np.ndarray, "28 3"]]:
-    """Return vertices and triangles, wound outwards, of a bin in its frame: the floor's upper side is at z = 0."""
+    """Return vertices and triangles, wound outwards, of a bin with flat rims; the floor's upper side is at z = 0."""
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
     inner = corners * [bin.length, bin.width]
     outer = corners * [bin.length + 2 * bin.thickness, bin.width + 2 * bin.thickness]
@@ -136,19 +121,19 @@ def bin_triangles(bin: Bin) -> tuple[Float[np.ndarray, "16 3"], Int[np.ndarray, 
     return vertices, np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]]).astype(np.int32)
 
 
-def render(mesh: RayMesh, scene: BinScene, *, include_bin: bool = True) -> Rendering:
-    """Render the copies of an object, and the bin, from the scene's camera; the same input gives the same bits.
+def render(mesh: RayMesh, scene: BinScene) -> Rendering:
+    """Render the copies of an object and the bin from the scene's camera; the same input gives the same bits.
 
     Raises InputError for poses that are not rigid or not finite, and for a camera below the bin's floor.
     """
-    _check_scene(scene, include_bin)
+    _check_scene(scene)
     camera, poses = scene.camera, scene.T_camera_object
     width, height, total = camera.width, camera.height, len(poses)
     depth = np.full((height, width), np.inf, np.float32)
     instances = np.full((height, width), -1, np.int32)
     normals = np.zeros((height, width, 3), np.float32)
     counts, boxes = np.zeros(total, np.int32), np.full((total, 4), -1, np.int32)
-    bodies = [(mesh, pose) for pose in poses] + ([(bin_mesh(scene.bin), scene.T_camera_bin)] if include_bin else [])
+    bodies = [*((mesh, pose) for pose in poses), (RayMesh(*bin_triangles(scene.bin)), scene.T_camera_bin)]
     for number, (body, pose) in enumerate(bodies):
         left, top, right, bottom = _window(body, pose, camera)
         if left >= right or top >= bottom:
@@ -181,39 +166,27 @@ def render(mesh: RayMesh, scene: BinScene, *, include_bin: bool = True) -> Rende
         visible_pixels=np.bincount(instances.ravel() + 1, minlength=total + 2)[1 : total + 1].astype(np.int32),
         total_pixels=counts,
         total_boxes=boxes,
-        include_bin=include_bin,
     )
 
 
 def visible_surfels(
-    mesh: RayMesh,
-    scene: BinScene,
-    points: Float[np.ndarray, "m 3"],
-    normals: Float[np.ndarray, "m 3"],
-    *,
-    include_bin: bool = True,
-    lift: float = LIFT,
+    mesh: RayMesh, scene: BinScene, points: Float[np.ndarray, "m 3"], normals: Float[np.ndarray, "m 3"]
 ) -> Bool[np.ndarray, "n m"]:
     """Tell for each copy which of its surfels the camera sees: facing it, in the picture, and with nothing before it.
 
-    Points and outward normals are in the object's frame; `lift` is that of `hidden_from`. Raises InputError as
-    `render` does.
+    Points and outward normals are in the object's frame. Raises InputError as `render` does, and for points or normals
+    that are not finite.
     """
-    _check_scene(scene, include_bin)
-    return _visible(mesh, scene, scene.T_camera_object, points, normals, include_bin, lift)
+    _check_scene(scene)
+    return _visible(mesh, scene, scene.T_camera_object, points, normals)
 
 
 def visible_bin_surfels(
-    mesh: RayMesh,
-    scene: BinScene,
-    points: Float[np.ndarray, "m 3"],
-    normals: Float[np.ndarray, "m 3"],
-    *,
-    lift: float = LIFT,
+    mesh: RayMesh, scene: BinScene, points: Float[np.ndarray, "m 3"], normals: Float[np.ndarray, "m 3"]
 ) -> Bool[np.ndarray, " m"]:
     """Tell which surfels of the bin, given in its frame, the camera sees; otherwise as `visible_surfels`."""
-    _check_scene(scene, True)
-    return _visible(mesh, scene, scene.T_camera_bin[None], points, normals, True, lift)[0]
+    _check_scene(scene)
+    return _visible(mesh, scene, scene.T_camera_bin[None], points, normals)[0]
 
 
 def pack_bits(visible: Bool[np.ndarray, "*n m"]) -> UInt8[np.ndarray, "*n b"]:
@@ -227,24 +200,19 @@ def hidden_from(
     points: Float[np.ndarray, "k 3"],
     normals: Float[np.ndarray, "k 3"],
     eye: Float[np.ndarray, "3"],
-    *,
-    include_bin: bool = True,
-    lift: float = LIFT,
 ) -> Bool[np.ndarray, " k"]:
     """Tell which points on surfaces an eye cannot see, all in the camera frame: turned away, or something is between.
 
-    What is less than `lift` diagonals above a point's own plane, on the way to the eye, is not between: so rounding, of
-    rays and of the points themselves, hides none behind its own surface, however slanted. Raises InputError as
-    `render` does.
+    What is less than `LIFT` diagonals above a point's own plane, on the way to the eye, is not between: so rounding, of
+    rays and of the points themselves, hides none behind its own surface, however slanted. The scene is one that
+    `render` takes, and all numbers are finite.
     """
-    _check_scene(scene, include_bin)
-    _check_surfels(points, normals, lift)
     rays = points.astype(np.float64) - eye
     slope = -np.einsum("kc,kc->k", rays, normals)
     hidden = slope <= 0
     facing = ~hidden
-    shortened = np.maximum(slope[facing] - lift * mesh.diagonal, 0) / slope[facing]
-    hidden[facing] = _blocked(mesh, scene, eye + shortened[:, None] * rays[facing], eye, include_bin)
+    shortened = np.maximum(slope[facing] - LIFT * mesh.diagonal, 0) / slope[facing]
+    hidden[facing] = _blocked(mesh, scene, eye + shortened[:, None] * rays[facing], eye)
     return hidden
 
 
@@ -254,10 +222,9 @@ def _visible(
     poses: Float[np.ndarray, "n 4 4"],
     points: Float[np.ndarray, "m 3"],
     normals: Float[np.ndarray, "m 3"],
-    include_bin: bool,
-    lift: float,
 ) -> Bool[np.ndarray, "n m"]:
-    _check_surfels(points, normals, lift)
+    if not np.isfinite(points).all() or not np.isfinite(normals).all():
+        raise InputError("the points or normals hold NaN or infinite values: remove such points first")
     camera = scene.camera
     at = points.astype(np.float64) @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
     out = normals.astype(np.float64) @ poses[:, :3, :3].transpose(0, 2, 1)
@@ -266,16 +233,14 @@ def _visible(
     seen = z > 0
     seen &= (camera.fx * x >= (-0.5 - camera.cx) * z) & (camera.fx * x < (camera.width - 0.5 - camera.cx) * z)
     seen &= (camera.fy * y >= (-0.5 - camera.cy) * z) & (camera.fy * y < (camera.height - 0.5 - camera.cy) * z)
-    seen[seen] = ~hidden_from(mesh, scene, at[seen], out[seen], np.zeros(3), include_bin=include_bin, lift=lift)
+    seen[seen] = ~hidden_from(mesh, scene, at[seen], out[seen], np.zeros(3))
     return seen
 
 
 def _blocked(
-    mesh: RayMesh, scene: BinScene, points: Float[np.ndarray, "k 3"], eye: Float[np.ndarray, "3"], include_bin: bool
+    mesh: RayMesh, scene: BinScene, points: Float[np.ndarray, "k 3"], eye: Float[np.ndarray, "3"]
 ) -> Bool[np.ndarray, " k"]:
-    hidden = np.zeros(len(points), dtype=bool)
-    if include_bin:
-        hidden = bin_mesh(scene.bin).blocks(scene.T_camera_bin, points, eye)
+    hidden = RayMesh(*bin_triangles(scene.bin)).blocks(scene.T_camera_bin, points, eye)
     poses = scene.T_camera_object
     rays = points - eye
     distances = np.linalg.norm(rays, axis=1)
@@ -309,34 +274,10 @@ def _window(body: RayMesh, pose: Float[np.ndarray, "4 4"], camera: Camera) -> tu
     return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 
-def _check_scene(scene: BinScene, include_bin: bool) -> None:
-    if scene.T_bin_object.ndim != 3 or scene.T_bin_object.shape[1:] != (4, 4) or scene.T_camera_bin.shape != (4, 4):
-        raise InputError(
-            f"T_bin_object has shape {scene.T_bin_object.shape} and T_camera_bin {scene.T_camera_bin.shape}, but they"
-            " must have shapes (n, 4, 4) and (4, 4)"
-        )
-    poses = np.concatenate([scene.T_bin_object, scene.T_camera_bin[None]])
-    names = [f"T_bin_object[{i}]" for i in range(len(poses) - 1)] + ["T_camera_bin"]
-    finite = np.isfinite(poses).all(axis=(1, 2))
-    turned = poses[:, :3, :3]
-    product = turned @ turned.transpose(0, 2, 1)
-    # As kmn_jax.errors.rigid_pose, for all poses at once.
-    rigid = (np.abs(product - np.eye(3)) < 5e-3).all(axis=(1, 2)) & (np.linalg.det(turned) > 0)
-    rigid &= (np.abs(poses[:, 3] - [0, 0, 0, 1]) < 1e-6).all(axis=1)
-    for name, is_finite, is_rigid in zip(names, finite, rigid, strict=True):
-        if not is_finite:
-            raise InputError(f"{name} holds NaN or infinite values: leave this copy out or mend its pose")
-        if not is_rigid:
-            raise InputError(
-                f"{name} is not a rigid pose: it needs a rotation without scale or reflection and a last row 0 0 0 1"
-            )
+def _check_scene(scene: BinScene) -> None:
+    rigid_pose(scene.T_camera_bin, "T_camera_bin")
+    for number, pose in enumerate(scene.T_bin_object):
+        rigid_pose(pose, f"T_bin_object[{number}]")
     height = float(np.linalg.inv(scene.T_camera_bin)[2, 3])
-    if include_bin and height <= 0:
+    if height <= 0:
         raise InputError(f"the camera is {-height:g} below the bin's floor: it sees nothing but its underside")
-
-
-def _check_surfels(points: Float[np.ndarray, "m 3"], normals: Float[np.ndarray, "m 3"], lift: float) -> None:
-    if not 0 <= lift < np.inf:
-        raise InputError(f"lift is {lift}, but must be zero or above, in diagonals")
-    if not np.isfinite(points).all() or not np.isfinite(normals).all():
-        raise InputError("the points or normals hold NaN or infinite values: remove such points first")

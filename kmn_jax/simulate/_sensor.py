@@ -107,8 +107,8 @@ def sense(
             < config.flank_loss * np.clip(1 - cosine, 0, 1) ** config.flank_power
         )
     if any(config.projector):
-        eye, hit, include_bin = diagonal * np.array(config.projector), exact > 0, rendering.include_bin
-        missing[hit] |= hidden_from(mesh, scene, points[hit], normals[hit], eye, include_bin=include_bin)
+        hit = exact > 0
+        missing[hit] |= hidden_from(mesh, scene, points[hit], normals[hit], diagonal * np.array(config.projector))
     depth = exact
     if config.noise > 0:
         growth = 1 + config.slant_noise * (1 / np.maximum(cosine, _LEAST_COSINE) - 1)

@@ -6,6 +6,7 @@ copies. All of it is one scene at a time, in arrays of a fixed size.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -14,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from kmn_jax.errors import InputError
 from kmn_jax.geometry import Intrinsics, inverse
 from kmn_jax.typing import Mask, Normals, Points, Pose, Scalar
 
@@ -21,7 +23,15 @@ BIN = -1  # the instance of points on the bin
 
 # Of the plastic number, in units of 2**-32: the two-dimensional sequence that spreads most evenly (Roberts, "R2").
 _STEPS = (3242174889, 2447445414)
-_STEEPEST = 1.5  # a disc's depth departs from its centre's by at most this many spacings
+
+# In the surfels' mean spacing. These agree best with ray casting on piles of electronic components and mechanical
+# parts, see benchmarks/scenes.py. Discs reach beyond the edge of a surface. So that they do not hide the face next to
+# it, whether a point is hidden is asked for a place above it, along its normal.
+_PIXEL = 0.75  # side of a pixel at the surfels' mean depth, more if the scene is too large for the buffer
+_DISC_RADIUS = 0.9
+_STEEPEST = 1.5  # a disc's depth departs from its centre's by at most this
+_LIFT = 0.6  # how far above a point its visibility is tested
+_TOLERANCE = 0.4  # how far behind the buffer that place may lie
 
 
 class Surfels(NamedTuple):
@@ -53,28 +63,14 @@ class VisiblePoints(NamedTuple):
 
 @dataclass(frozen=True)
 class SplatConfig:
-    """Choose buffer and tolerances of the splatting; lengths are multiples of the surfels' mean spacing.
-
-    The defaults agree best with ray casting on piles of electronic components and mechanical parts, see
-    benchmarks/scenes.py. Discs reach beyond the edge of a surface. So that they do not hide the face next to it,
-    whether a point is hidden is asked for a place above it, along its normal.
-    """
+    """Choose how finely splatting draws."""
 
     resolution: int = 512  # pixels of the z-buffer along each side
-    pixel: float = 0.75  # side of a pixel at the surfels' mean depth, more if the scene is too large for the buffer
-    disc_radius: float = 0.9
-    lift: float = 0.6  # how far above a point its visibility is tested
-    tolerance: float = 0.4  # how far behind the buffer that place may lie
     num_bin_surfels: int = 16384  # points made on the bin's floor and walls if there is a bin
 
     def __post_init__(self) -> None:
         if self.resolution < 2 or self.num_bin_surfels < 1:
-            raise ValueError(f"resolution = {self.resolution} and num_bin_surfels = {self.num_bin_surfels} are too few")
-        lengths = (self.pixel, self.disc_radius, self.lift, self.tolerance)
-        if min(lengths) < 0 or min(lengths[:2]) <= 0:
-            raise ValueError(
-                f"pixel, disc_radius, lift, tolerance are {lengths}: none below zero, nor the first two zero"
-            )
+            raise InputError(f"resolution = {self.resolution} and num_bin_surfels = {self.num_bin_surfels} are too few")
 
 
 @partial(jax.jit, static_argnames="count")
@@ -124,21 +120,20 @@ def visible_from_bits(
     `copies` is false for padding, whose poses and bits may hold anything. With a bin and its bits there are 8 bin
     surfels, those of `bin_surfels`, for each of their bytes. They are few for so large a surface; `bin_splits` cuts the
     square that each stands for into so many rows and columns of points, which are all visible or none. Raises
-    ValueError if bits and surfels differ in number, or if only one of bin and bin bits is given.
+    InputError if bits and surfels differ in number, or if only one of bin and bin bits is given.
     """
     m = surfels.points.shape[0]
     if 8 * bits.shape[1] != m:
-        raise ValueError(f"{8 * bits.shape[1]} bits a copy do not fit {m} surfels")
+        raise InputError(f"{8 * bits.shape[1]} bits a copy do not fit {m} surfels")
     if (bin_in_view is None) != (bin_bits is None):
-        raise ValueError("bin_in_view and bin_bits belong together: give both or none")
-    num_copies = copies.shape[0]
+        raise InputError("bin_in_view and bin_bits belong together: give both or none")
     visible = jnp.unpackbits(bits, axis=1, bitorder="little").reshape(-1) > 0
     placed = _place(surfels, T_camera_object, copies)
     if bin_in_view is None or bin_bits is None:
-        return _gather(placed, visible, num_copies)
+        return _gather(len(copies), (placed, visible))
     on_bin = _place_bin(bin_in_view, 8 * bin_bits.shape[0], bin_splits)
     bin_visible = jnp.tile(jnp.unpackbits(bin_bits, bitorder="little") > 0, bin_splits**2)
-    return _gather(placed, visible, num_copies, on_bin, bin_visible)
+    return _gather(len(copies), (placed, visible), (on_bin, bin_visible))
 
 
 def visible_by_splatting(
@@ -156,20 +151,17 @@ def visible_by_splatting(
     Copies are padded as in `visible_from_bits`. What the bin's walls hide from a camera above the rim is exact; a
     camera below it sees only what rises above it.
     """
-    num_copies = copies.shape[0]
     spacing = jnp.sqrt(surfels.area / surfels.points.shape[0])
     placed = _place(surfels, T_camera_object, copies)
     drawn = _facing(placed) & _in_image(placed, camera)
-    buffer = _draw(placed, drawn, spacing, config)
-    visible = drawn & _unhidden(placed, buffer, spacing, config)
+    buffer = _draw(placed, drawn, spacing, config.resolution)
+    visible = drawn & _unhidden(placed, buffer, spacing)
     if bin_in_view is None:
-        return _gather(placed, visible, num_copies)
+        return _gather(len(copies), (placed, visible))
     on_bin = _place_bin(bin_in_view, config.num_bin_surfels)
-    bin_visible = _facing(on_bin) & _in_image(on_bin, camera) & _unhidden(on_bin, buffer, spacing, config)
-    visible, bin_visible = (
-        seen & _over_rim(rows, bin_in_view) for seen, rows in ((visible, placed), (bin_visible, on_bin))
-    )
-    return _gather(placed, visible, num_copies, on_bin, bin_visible)
+    bin_visible = _facing(on_bin) & _in_image(on_bin, camera) & _unhidden(on_bin, buffer, spacing)
+    parts = ((rows, seen & _over_rim(rows, bin_in_view)) for rows, seen in ((placed, visible), (on_bin, bin_visible)))
+    return _gather(len(copies), *parts)
 
 
 class _Placed(NamedTuple):
@@ -248,9 +240,8 @@ def _over_rim(placed: _Placed, bin_in_view: BinInView) -> Mask:
     return (z >= height) | (across & (eye[2] > height))
 
 
-def _draw(placed: _Placed, drawn: Mask, spacing: Scalar, config: SplatConfig) -> _Buffer:
+def _draw(placed: _Placed, drawn: Mask, spacing: Scalar, size: int) -> _Buffer:
     """Draw each surfel's disc at the four pixels around its projection and keep the least depth."""
-    size = config.resolution
     x, y, z = placed.points
     directions = [coordinate / jnp.where(drawn, z, 1) for coordinate in (x, y)]
     count = drawn.sum()
@@ -260,7 +251,7 @@ def _draw(placed: _Placed, drawn: Mask, spacing: Scalar, config: SplatConfig) ->
         for bound, worst in ((jnp.min, jnp.inf), (jnp.max, -jnp.inf))
     )
     mean_depth = jnp.where(some, jnp.where(drawn, z, 0).sum() / jnp.maximum(count, 1).astype(jnp.float32), 1)
-    finest = config.pixel * spacing / mean_depth
+    finest = _PIXEL * spacing / mean_depth
     pitch = [jnp.maximum((end - begin) / (size - 1), finest) for begin, end in zip(low, high, strict=True)]
     buffer = _Buffer(jnp.full(size * size, jnp.inf), (low[0], low[1]), (pitch[0], pitch[1]))
     columns, rows = _pixels(placed.points, buffer)
@@ -272,7 +263,7 @@ def _draw(placed: _Placed, drawn: Mask, spacing: Scalar, config: SplatConfig) ->
         column, row = first_column + corner[0], first_row + corner[1]
         u, v, disc_depth = _plane_depth(placed, buffer, column, row, spacing)
         square_distance = (u * disc_depth - x) ** 2 + (v * disc_depth - y) ** 2 + (disc_depth - z) ** 2
-        covered = (square_distance <= (config.disc_radius * spacing) ** 2) | (
+        covered = (square_distance <= (_DISC_RADIUS * spacing) ** 2) | (
             (column == nearest_column) & (row == nearest_row)
         )
         covered = covered & drawn & (column < size) & (row < size)
@@ -283,14 +274,14 @@ def _draw(placed: _Placed, drawn: Mask, spacing: Scalar, config: SplatConfig) ->
     return buffer._replace(depth=jax.lax.scan(draw_corner, buffer.depth, corners)[0])
 
 
-def _unhidden(placed: _Placed, buffer: _Buffer, spacing: Scalar, config: SplatConfig) -> Bool[Array, " r"]:
+def _unhidden(placed: _Placed, buffer: _Buffer, spacing: Scalar) -> Bool[Array, " r"]:
     """Tell which points that face the camera are, lifted off their surface, at most the tolerance behind the buffer."""
-    size, lift = config.resolution, config.lift * spacing
+    size, lift = math.isqrt(len(buffer.depth)), _LIFT * spacing
     x, y, z = (place + lift * normal for place, normal in zip(placed.points, placed.normals, strict=True))
     columns, rows = (jnp.round(pixel) for pixel in _pixels((x, y, z), buffer))
     outside = (columns < 0) | (columns >= size) | (rows < 0) | (rows >= size)
     depth = buffer.depth[jnp.where(outside, 0, rows * size + columns).astype(jnp.int32)]
-    return outside | (z <= depth + config.tolerance * spacing)
+    return outside | (z <= depth + _TOLERANCE * spacing)
 
 
 def _pixels(
@@ -312,29 +303,26 @@ def _plane_depth(
     return u, v, jnp.clip(depth, z - reach, z + reach)
 
 
-def _gather(
-    placed: _Placed,
-    visible: Bool[Array, " m"],
-    num_copies: int,
-    on_bin: _Placed | None = None,
-    bin_visible: Bool[Array, " b"] | None = None,
-) -> VisiblePoints:
-    """Join objects and bin into the result."""
-    picture_area = _picture_area(placed)
-    unhidden = picture_area.reshape(num_copies, -1).sum(axis=1)
-    seen = jnp.where(visible, picture_area, 0).reshape(num_copies, -1).sum(axis=1)
-    instance = jnp.repeat(jnp.arange(num_copies, dtype=jnp.int32), visible.shape[0] // num_copies)
-    points, normals, mask = [*placed.points], [*placed.normals], visible & placed.real
-    if on_bin is not None and bin_visible is not None:
-        points, normals = (
-            [jnp.concatenate(pair) for pair in zip(rows, added, strict=True)]
-            for rows, added in ((points, on_bin.points), (normals, on_bin.normals))
-        )
-        picture_area = jnp.concatenate([picture_area, _picture_area(on_bin)])
-        instance = jnp.concatenate([instance, jnp.full(bin_visible.shape, BIN, dtype=jnp.int32)])
-        mask = jnp.concatenate([mask, bin_visible])
-    fraction = seen / jnp.where(unhidden > 0, unhidden, 1)
-    return VisiblePoints(jnp.stack(points, axis=1), jnp.stack(normals, axis=1), picture_area, instance, mask, fraction)
+def _gather(num_copies: int, *parts: tuple[_Placed, Bool[Array, " _"]]) -> VisiblePoints:
+    """Join the surfels of the copies, and those of the bin if given, with which of them are visible."""
+    points, normals = (
+        jnp.stack([jnp.concatenate(column) for column in zip(*rows, strict=True)], axis=1)
+        for rows in ([placed.points for placed, _ in parts], [placed.normals for placed, _ in parts])
+    )
+    areas = [_picture_area(placed) for placed, _ in parts]
+    _, visible = parts[0]
+    unhidden = areas[0].reshape(num_copies, -1).sum(axis=1)
+    seen = jnp.where(visible, areas[0], 0).reshape(num_copies, -1).sum(axis=1)
+    instances = [jnp.repeat(jnp.arange(num_copies, dtype=jnp.int32), visible.shape[0] // num_copies)]
+    instances += [jnp.full(on_bin.shape, BIN, dtype=jnp.int32) for _, on_bin in parts[1:]]
+    return VisiblePoints(
+        points,
+        normals,
+        jnp.concatenate(areas),
+        jnp.concatenate(instances),
+        jnp.concatenate([visible & placed.real for placed, visible in parts]),
+        seen / jnp.where(unhidden > 0, unhidden, 1),
+    )
 
 
 def _picture_area(placed: _Placed) -> Float[Array, " r"]:

@@ -70,16 +70,9 @@ def place_camera(
     T_camera_bin[1, :3] = np.sin(roll) * right + np.cos(roll) * down
     T_camera_bin[2, :3] = -back
     T_camera_bin[:3, 3] = -T_camera_bin[:3, :3] @ (target + distance * back)
-    corners = bin_corners(bin) @ T_camera_bin[:3, :3].T + T_camera_bin[:3, 3]
+    low = np.array([-outer[0] / 2, -outer[1] / 2, -bin.thickness])
+    corners = (low + outer * list(np.ndindex(2, 2, 2))) @ T_camera_bin[:3, :3].T + T_camera_bin[:3, 3]
     reach = np.abs(corners[:, :2] / corners[:, 2:]).max(axis=0)
     middle = np.array([config.width - 1, config.height - 1]) / 2
     focal = float((middle / reach).min()) * rng.uniform(*config.fill)
     return Camera(focal, focal, middle[0], middle[1], config.width, config.height), T_camera_bin
-
-
-def bin_corners(bin: Bin) -> Float[np.ndarray, "8 3"]:
-    """Return the outer corners of a bin in its frame: those of the floor's underside, then those of the rim."""
-    across, along = bin.length / 2 + bin.thickness, bin.width / 2 + bin.thickness
-    return np.array(
-        [[x, y, z] for z in (-bin.thickness, bin.height) for y in (-along, along) for x in (-across, across)]
-    )

@@ -67,7 +67,7 @@ def rendered_frames(
 
     Problems of single frames and objects go to `report`. Raises InputError if nothing of it can be used.
     """
-    dataset = BopDataset.open(folder, split, unit=_UNIT)
+    dataset = BopDataset(folder, split, unit=_UNIT)
     models, problems = load_models(dataset, ObjectConfig(num_points=max(_NUM_POINTS, network.num_object_points)))
     for problem in problems:
         if report is not None:

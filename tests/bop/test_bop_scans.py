@@ -11,6 +11,7 @@ import pytest
 
 from kmn_jax.bop import BopDataset, bop_scan, bop_scene_id, bop_sizes, is_bop_image
 from kmn_jax.errors import InputError
+from kmn_jax.geometry import measured_points
 from tests.bop.bop_sample import edit_json, sample_frame, save_image, write_blenderproc, write_sample
 
 
@@ -21,12 +22,11 @@ def image(tmp_path: Path) -> Path:
 
 def test_it_is_the_frame_of_its_dataset(image: Path) -> None:
     scan, instances = bop_scan(image)
-    frame = BopDataset.open(image.parents[3], "test").frame(3, 1)
+    frame = BopDataset(image.parents[3], "test").frame(3, 1)
     assert is_bop_image(image)
     assert (scan.unit, scan.camera, scan.normals) == ("mm", frame.camera, None)
     np.testing.assert_array_equal(scan.depth, frame.depth)
-    points = np.asarray(frame.points()).reshape(-1, 3)
-    np.testing.assert_allclose(scan.points, points[frame.depth.ravel() > 0], rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(scan.points, measured_points(frame.depth, frame.camera), rtol=1e-5, atol=1e-4)
     truth = sample_frame(31)
     assert scan.depth is not None
     np.testing.assert_allclose(scan.depth, truth.depth * 1000, atol=0.011)  # half a step

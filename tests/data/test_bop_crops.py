@@ -68,7 +68,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def crops_of(folder: Path, config: BopCropConfig = CONFIG) -> BopCrops:
-    return BopCrops(BopDataset.open(folder, "test"), MODELS, config)
+    return BopCrops(BopDataset(folder, "test"), MODELS, config)
 
 
 def batches(crops: BopCrops, ordered: bool = False) -> SampleBatches:
@@ -201,7 +201,7 @@ def test_frames_that_files_show_broken_are_left_out_by_name(folder: Path) -> Non
     edit_json(folder / "test/000000/scene_gt.json", "1", 0, "cam_t_m2c", value=[1.0, 2.0])
     (folder / "test/000003/depth/000002.png").unlink()
     reported: list[str] = []
-    crops = BopCrops(BopDataset.open(folder, "test"), MODELS, CONFIG, report=reported.append)
+    crops = BopCrops(BopDataset(folder, "test"), MODELS, CONFIG, report=reported.append)
     assert crops.keys == ((0, 0), (0, 2), (3, 0), (3, 1))
     assert crops.problems == reported
     assert len(reported) == 2
@@ -223,17 +223,17 @@ def test_images_that_break_on_reading_are_not_fatal(folder: Path) -> None:
     (problem,) = crops.problems
     assert "frame 1 of scene 3" in problem
     assert str(path) in problem
-    decoded = BopCrops(BopDataset.open(folder, "test"), MODELS, CONFIG, decode=True)
+    decoded = BopCrops(BopDataset(folder, "test"), MODELS, CONFIG, decode=True)
     assert (3, 1) not in decoded.keys
     assert str(path) in decoded.problems[0]
 
 
 def test_only_objects_with_a_model_are_cropped(folder: Path) -> None:
-    crops = BopCrops(BopDataset.open(folder, "test"), {2: ball()}, CONFIG)
+    crops = BopCrops(BopDataset(folder, "test"), {2: ball()}, CONFIG)
     batch = crops.read(batches(crops)[0])
     assert batch.crop.valid.all()
     assert set(batch.crop.instance.tolist()) == {1}
-    none = BopCrops(BopDataset.open(folder, "test"), {7: ball()}, CONFIG)
+    none = BopCrops(BopDataset(folder, "test"), {7: ball()}, CONFIG)
     assert not none.read(batches(none)[0]).crop.valid.any()
 
 
@@ -250,7 +250,7 @@ def test_hidden_instances_give_no_seeds(folder: Path) -> None:
 
 
 def test_models_are_read_in_the_unit_of_the_dataset(tmp_path: Path) -> None:
-    dataset = BopDataset.open(write_sample(tmp_path), "test", "cm")
+    dataset = BopDataset(write_sample(tmp_path), "test", "cm")
     (tmp_path / "models/obj_000002.ply").write_bytes(b"ply\n")
     models, problems = load_models(dataset, ObjectConfig(num_points=64))
     assert list(models) == [1]
@@ -261,7 +261,7 @@ def test_models_are_read_in_the_unit_of_the_dataset(tmp_path: Path) -> None:
 
 def test_what_cannot_be_cropped_is_refused(folder: Path) -> None:
     with pytest.raises(InputError, match="without ground truth"):
-        BopCrops(BopDataset.open(folder, "test", ground_truth=False), MODELS, CONFIG)
+        BopCrops(BopDataset(folder, "test", ground_truth=False), MODELS, CONFIG)
     with pytest.raises(InputError, match="has 512 points, too few for 600 keypoints"):
         crops_of(folder, BopCropConfig(num_keypoints=600))
     with pytest.raises(InputError, match='use "estimated"'):
@@ -269,7 +269,7 @@ def test_what_cannot_be_cropped_is_refused(folder: Path) -> None:
     with pytest.raises(InputError, match="label_tolerance"):
         BopCropConfig(label_tolerance=0.0)
     with pytest.raises(InputError, match="no object has a model"):
-        BopCrops(BopDataset.open(folder, "test"), {}, CONFIG)
+        BopCrops(BopDataset(folder, "test"), {}, CONFIG)
     for scene in ("000000", "000003"):
         (folder / "test" / scene / "scene_camera.json").write_text("{")
     with pytest.raises(InputError, match=r"no usable frame.*scene_camera.json"):

@@ -47,7 +47,7 @@ def of_mesh(mesh: Mesh) -> Part:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    depth = render(RayMesh(*notched_box()), camera_scene([TRUE], CAMERA), include_bin=False).depth.astype(np.float32)
+    depth = render(RayMesh(*notched_box()), camera_scene([TRUE], CAMERA)).depth.astype(np.float32)
     points = measured_points(depth, CAMERA)
     return make_scene(Scan(points, None, depth, CAMERA, "m"), 1.0, inside=np.ones(len(points), dtype=bool))
 

@@ -17,8 +17,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from kmn_jax.bop import BopEstimate, bop_scan, write_results
-from kmn_jax.bop._results import read_results
+from kmn_jax.bop import bop_scan
 from kmn_jax.errors import InputError
 from kmn_jax.io import read_mesh, read_scan
 from kmn_jax.io._meshes import CLOUD_SUFFIXES
@@ -292,15 +291,6 @@ def test_object_cards(tmp_path: Path) -> None:
     )
     save_part(part, tmp_path / "ball.kmn")
     check_reader(load_part, tmp_path / "ball.kmn", (tmp_path / "ball.kmn").read_bytes(), 60)
-
-
-def test_result_tables(tmp_path: Path) -> None:
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    poses[:, :3, 3] = RNG.uniform(100, 200, (3, 3))
-    write_results(tmp_path / "poses.csv", [BopEstimate(1, 2, 3, 0.5, pose, 0.25) for pose in poses], "mm")
-    check_reader(
-        lambda path: read_results(path, "mm"), tmp_path / "poses.csv", (tmp_path / "poses.csv").read_bytes(), 60
-    )
 
 
 SIGNALLING = b"\x01\x00\xa0\x7f"  # a NaN whose conversion warns

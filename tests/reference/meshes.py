@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,9 @@ from kmn_jax.simulate import Bin, BinScene
 from kmn_jax.simulate._raycast import bin_triangles
 
 Mesh = tuple[np.ndarray, np.ndarray]
+CAMERA = Camera(fx=200.0, fy=190.0, cx=78.3, cy=61.9, width=160, height=120)
+WIDE = Camera(fx=500.0, fy=500.0, cx=199.5, cy=149.5, width=400, height=300)
+TOP = np.diag([1.0, -1, -1])  # the bin from above: its x to the right, its y upwards in the picture
 
 
 def box(*extents: float) -> Mesh:
@@ -80,8 +84,14 @@ def random_rotations(count: int, seed: int) -> np.ndarray:
 
 
 def camera_scene(poses: list[np.ndarray], camera: Camera) -> BinScene:
-    """Return a scene whose poses are given in the camera frame; its bin is not to be rendered."""
-    return BinScene(Bin(1.0, 1.0, 1.0, 0.1), np.array(poses).reshape(-1, 4, 4), camera, np.eye(4))
+    """Return a scene whose poses are given in the camera frame; its bin is out of sight."""
+    return without_bin(BinScene(Bin(1.0, 1.0, 1.0, 0.1), np.array(poses).reshape(-1, 4, 4), camera, np.eye(4)))
+
+
+def without_bin(scene: BinScene) -> BinScene:
+    """Return a scene with its bin behind the camera, where it is neither seen nor hides anything."""
+    T_camera_bin = pose((0, 0, -10.0))
+    return replace(scene, T_bin_object=np.linalg.inv(T_camera_bin) @ scene.T_camera_object, T_camera_bin=T_camera_bin)
 
 
 def pile(count: int, camera: Camera, seed: int = 0, height: float = 7.0) -> BinScene:

@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 
 from kmn_jax.errors import InputError
 from kmn_jax.simulate import HullConfig, collision_shape
-from kmn_jax.simulate._hulls import collision_hulls
 
 FACES = np.array(
     [
@@ -65,7 +64,7 @@ def thickness(part):
 
 def test_box_is_one_part_of_eight_corners():
     vertices, triangles = boxes(([1, 2, 3], [4, 4, 4]))
-    (part,) = collision_hulls(vertices, triangles)
+    (part,) = collision_shape(vertices, triangles).parts
     assert part.shape == (8, 3)
     np.testing.assert_allclose(sorted(map(tuple, part)), sorted(map(tuple, vertices)), atol=1e-12)
 
@@ -101,7 +100,7 @@ def test_mass_properties_add_up_over_parts():
 
 @pytest.mark.parametrize(("surface", "volume"), [(L_SHAPE, 6.0), (BOLT, 20 * np.sin(np.pi / 20) * (8 + 4))])
 def test_concave_shapes_are_cut_where_they_bend(surface, volume):
-    parts = collision_hulls(*surface)
+    parts = collision_shape(*surface).parts
     assert len(parts) == 2
     assert sum(ConvexHull(part).volume for part in parts) == pytest.approx(volume, rel=0.01)
 
@@ -118,7 +117,7 @@ def test_concave_shapes_are_cut_where_they_bend(surface, volume):
     ],
 )
 def test_parts_cover_the_surface_and_stay_in_its_hull(surface):
-    parts = collision_hulls(*surface)
+    parts = collision_shape(*surface).parts
     vertices, triangles = surface
     diagonal = np.linalg.norm(np.ptp(vertices, axis=0))
     assert 1 <= len(parts) <= HullConfig().parts
@@ -130,7 +129,7 @@ def test_parts_cover_the_surface_and_stay_in_its_hull(surface):
 def test_thin_pins_stay_in_a_thick_part():
     block = ([0, 0, 0], [6, 3, 3])
     pins = [([x, 1.4, -3], [x + 0.2, 1.6, 0]) for x in (0.5, 3.0, 5.3)]
-    parts = collision_hulls(*boxes(block, *pins))
+    parts = collision_shape(*boxes(block, *pins)).parts
     diagonal = np.linalg.norm([6, 3, 6])
     assert min(thickness(part) for part in parts) > 0.1 * diagonal
     assert min(part[:, 2].min() for part in parts) == pytest.approx(-3)
@@ -139,24 +138,24 @@ def test_thin_pins_stay_in_a_thick_part():
 @pytest.mark.parametrize("size", [(10, 0.3, 0.3), (10, 8, 0.2)])
 def test_thin_objects_are_one_hull(size):
     bracket = boxes(([0, 0, 0], size), ([0, 0, 0], [1, size[1], 0.5]))
-    assert len(collision_hulls(*bracket)) == 1
+    assert len(collision_shape(*bracket).parts) == 1
 
 
 def test_number_of_parts_is_bounded():
     stairs = boxes(*[([i, 0, 0], [i + 1, 6, i + 1]) for i in range(10)])
-    assert len(collision_hulls(*stairs, HullConfig(parts=1))) == 1
-    three = collision_hulls(*stairs, HullConfig(parts=3, gain=0.001, thickness=0.01))
-    eight = collision_hulls(*stairs, HullConfig(parts=8, gain=0.001, thickness=0.01))
+    assert len(collision_shape(*stairs, HullConfig(parts=1)).parts) == 1
+    three = collision_shape(*stairs, HullConfig(parts=3, gain=0.001, thickness=0.01)).parts
+    eight = collision_shape(*stairs, HullConfig(parts=8, gain=0.001, thickness=0.01)).parts
     assert (len(three), len(eight)) == (3, 8)
     assert sum(ConvexHull(part).volume for part in eight) < sum(ConvexHull(part).volume for part in three)
 
 
 def test_same_surface_same_bits_and_unit_does_not_matter():
     vertices, triangles = BOLT
-    parts = collision_hulls(vertices, triangles)
-    for part, again in zip(parts, collision_hulls(vertices.copy(), triangles), strict=True):
+    parts = collision_shape(vertices, triangles).parts
+    for part, again in zip(parts, collision_shape(vertices.copy(), triangles).parts, strict=True):
         np.testing.assert_array_equal(part, again)
-    scaled = collision_hulls(1e-3 * vertices + 5, triangles)
+    scaled = collision_shape(1e-3 * vertices + 5, triangles).parts
     assert len(scaled) == len(parts)
     for part, other in zip(parts, scaled, strict=True):
         assert ConvexHull(other).volume == pytest.approx(1e-9 * ConvexHull(part).volume, rel=1e-6)
@@ -164,7 +163,7 @@ def test_same_surface_same_bits_and_unit_does_not_matter():
 
 def test_vertices_that_no_triangle_uses_do_not_count():
     vertices, triangles = boxes(([0, 0, 0], [1, 2, 3]))
-    (part,) = collision_hulls(np.concatenate([vertices, [[100, 100, np.nan]]]), triangles)
+    (part,) = collision_shape(np.concatenate([vertices, [[100, 100, np.nan]]]), triangles).parts
     assert part.max() == 3
 
 
@@ -182,8 +181,8 @@ BOX = boxes(([0, 0, 0], [1, 1, 1]))
         (BOX[0], BOX[1][:0], "no triangles"),
         (BOX[0][:0], BOX[1][:0], "no triangles"),
         (np.where(BOX[0] == 1, np.nan, BOX[0]), BOX[1], "NaN"),
-        (BOX[0], BOX[1] + 5, "refer to vertices 5 to 12 of 8"),
-        (BOX[0], BOX[1] - 1, "refer to vertices -1 to 6 of 8"),
+        (BOX[0], BOX[1] + 5, "name vertices from 5 to 12 of 8"),
+        (BOX[0], BOX[1] - 1, "name vertices from -1 to 6 of 8"),
     ],
 )
 def test_surfaces_without_volume_are_refused(vertices, triangles, message, capfd):

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from kmn_jax.errors import InputError
-from kmn_jax.simulate import BinConfig, CollisionShape, collision_shape, settle
+from kmn_jax.simulate import BinConfig, collision_shape, settle
 
 CONFIG = BinConfig()
 
@@ -57,13 +57,10 @@ def interpenetration(shape, T_bin_object):
 @pytest.mark.parametrize("name", SHAPES)
 def test_copies_rest_in_the_bin_without_penetration(name, copies):
     shape = SHAPES[name]
-    result = settle(shape, copies, CONFIG, seed=(7, copies))
+    result = settle(shape, copies, CONFIG, (7, copies))
     assert result.accepted
     assert result.T_bin_object.shape == (copies, 4, 4)
     assert not result.capped
-    assert result.speed < CONFIG.rest_speed
-    assert result.rotation < CONFIG.rest_rotation
-    assert 0 < result.simulated_time < CONFIG.time_cap
     assert 0 < result.floor_share <= 1
     assert result.attempts == 1 + len(result.rejected)
 
@@ -113,10 +110,10 @@ def test_same_seed_same_bits():
     first, again, other = (settle(L_SHAPE, 6, CONFIG, seed) for seed in ((3, 1), (3, 1), (3, 2)))
     np.testing.assert_array_equal(first.T_bin_object, again.T_bin_object)
     assert first.bin == again.bin
-    assert (first.penetration, first.speed, first.simulated_time) == (
+    assert (first.penetration, first.floor_share, first.rejected) == (
         again.penetration,
-        again.speed,
-        again.simulated_time,
+        again.floor_share,
+        again.rejected,
     )
     assert not np.allclose(first.T_bin_object, other.T_bin_object, atol=1e-3)
 
@@ -131,7 +128,6 @@ def test_a_scene_that_is_not_at_rest_when_time_is_over_says_so():
     config = BinConfig(rest_speed=1e-12, rest_rotation=1e-12, time_cap=0.8)
     result = settle(BOX, 2, config, 0)
     assert result.capped
-    assert result.simulated_time == pytest.approx(0.8)
     assert result.accepted
 
 
@@ -186,13 +182,6 @@ def test_parts_of_one_copy_do_not_push_each_other():
 def test_wrong_arguments_are_refused(copies, seed, message):
     with pytest.raises(InputError, match=message):
         settle(BOX, copies, CONFIG, seed)
-
-
-@pytest.mark.parametrize(("diagonal", "volume"), [(0.0, 1.0), (1.0, 0.0), (math.nan, 1.0), (1.0, math.inf)])
-def test_shapes_without_volume_are_refused(diagonal, volume):
-    shape = CollisionShape(BOX.parts, diagonal, volume, BOX.center, BOX.R_object_principal, BOX.inertia)
-    with pytest.raises(InputError, match="diagonal"):
-        settle(shape, 1, CONFIG, 0)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from kmn_jax.errors import InputError
 from kmn_jax.geometry import Camera
 from kmn_jax.simulate import Bin, BinScene, RayMesh, SensorConfig, render, sense
 from kmn_jax.simulate._raycast import Rendering
-from tests.reference.meshes import box, bracket, camera_scene, pile, pose, sphere, square
+from tests.reference.meshes import box, bracket, camera_scene, pile, pose, sphere, square, without_bin
 
 CAMERA = Camera(fx=8000.0, fy=8000.0, cx=99.5, cy=99.5, width=200, height=200)  # narrow: its rays are near parallel
 PLANE = RayMesh(*square(1 / 2**0.5))  # of unit diagonal
@@ -28,7 +28,7 @@ def plane(distance: float, slant: float = 0.0) -> tuple[RayMesh, BinScene, Rende
     angle = np.radians(slant)
     R = np.array([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
     scene = camera_scene([pose((0, 0, distance), R)], CAMERA)
-    rendering = render(PLANE, scene, include_bin=False)
+    rendering = render(PLANE, scene)
     assert (rendering.depth > 0).all()
     return PLANE, scene, rendering
 
@@ -41,7 +41,7 @@ def two_plates(step: float) -> tuple[RayMesh, BinScene, Rendering]:
     near = pose((-half, 0, 8))
     far = pose((half * (8 + step) / 8 - 0.02, 0, 8 + step))
     scene = camera_scene([near, far], camera)
-    rendering = render(mesh, scene, include_bin=False)
+    rendering = render(mesh, scene)
     # Both plates reach beyond rows and columns 30 to 170; the nearer one ends between columns 99 and 100.
     window = rendering.instances[40:160, 40:160]
     np.testing.assert_array_equal(window, np.broadcast_to(np.arange(40, 160) > 99, window.shape).astype(int))
@@ -77,7 +77,7 @@ def test_noise_grows_with_slant(share: float, factor: float) -> None:
 def test_noise_is_relative_to_the_object() -> None:
     scene = camera_scene([pose((0, 0, 8000))], CAMERA)
     mesh = RayMesh(*square(1000 / 2**0.5))
-    rendering = render(mesh, scene, include_bin=False)
+    rendering = render(mesh, scene)
     large = sense(mesh, scene, rendering, SensorConfig(noise=0.001, step=0.0005), generator())
     small = sense(*plane(8.0), SensorConfig(noise=0.001, step=0.0005), generator())
     assert (np.abs(large / 1000 - small) < 1e-5).mean() > 0.99  # the rest lay between two steps
@@ -116,7 +116,7 @@ def test_edges_are_lost_with_their_probability_and_towards_nothing_too() -> None
     ]
     assert np.mean(losses) == pytest.approx(0.3, abs=0.01)  # 19,200 draws: 0.0033
     alone = replace(scene, T_bin_object=scene.T_bin_object[:1])
-    exact = render(mesh, alone, include_bin=False)
+    exact = render(mesh, alone)
     found = sense(mesh, alone, exact, SensorConfig(edge_width=2), generator())
     assert (found[40:160, 98:100] == 0).all()
     np.testing.assert_array_equal(found[40:160, 40:98], exact.depth[40:160, 40:98])
@@ -170,10 +170,10 @@ def test_the_bin_casts_a_shadow_only_if_it_is_there() -> None:
     scene = BinScene(Bin(6.0, 6.0, 1.5, 0.1), pose((-2, 0, 0.3))[None], camera, pose((0, 0, 6), TOP))
     config = SensorConfig(projector=(-6.0, 0.0, 0.0))  # from (-6, 6) the wall's rim at (-3, 1.5) shades all to x = -2.2
     copy_lost = []
-    for include_bin in (True, False):
-        rendering = render(mesh, scene, include_bin=include_bin)
+    for case in (scene, without_bin(scene)):
+        rendering = render(mesh, case)
         own = rendering.instances == 0
-        copy_lost.append((sense(mesh, scene, rendering, config, generator())[own] == 0).mean())
+        copy_lost.append((sense(mesh, case, rendering, config, generator())[own] == 0).mean())
     # The copy is at z = 0.3, from -2.354 to -1.646; the shadow there ends at -2.2.
     assert copy_lost[0] == pytest.approx((2.354 - 2.2) / 0.707, abs=0.01)
     assert copy_lost[1] == 0
@@ -217,7 +217,7 @@ def test_a_structured_light_scanner_is_deterministic_and_leaves_most_of_what_fac
 
 def test_a_picture_of_nothing_stays_empty() -> None:
     scene = camera_scene([pose((0, 0, -5))], CAMERA)
-    rendering = render(PLANE, scene, include_bin=False)
+    rendering = render(PLANE, scene)
     assert not sense(PLANE, scene, rendering, SensorConfig.structured_light(), generator()).any()
 
 
