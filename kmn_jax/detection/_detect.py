@@ -34,8 +34,8 @@ from kmn_jax.objects import Part
 _SHARES = ("explained", "violated", "occluded", "unknown")
 _CLOSE_GAP = 0.05  # of probabilities
 _CONSIDERED = 128  # most probable poses that are compared with each other: one number, so one compilation
-_SYMMETRIC = "the part is symmetric: of the poses that look the same, this is the canonical one"
-_RIVALLED = "another pose in this place is nearly as probable: the part may lie the other way round"
+_SYMMETRIC = "the object is symmetric: of the poses that look the same, this is the canonical one"
+_RIVALLED = "another pose in this place is nearly as probable: the object may lie the other way round"
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def explore(
             break
         if sum(len(found.seed_rows) for found in rounds) >= config.most_seeds:
             left = free.sum() / scene.foreground.sum()
-            warnings = (f"{left:.0%} of the foreground was not searched: narrow it down to where parts are",)
+            warnings = (f"{left:.0%} of the foreground was not searched: narrow it down to where the object may be",)
             break
     return join(rounds), warnings
 

@@ -106,7 +106,7 @@ class PoseEstimator:
         """
         parts = sorted([part] if isinstance(part, Part) else part, key=lambda one: one.in_unit("m").diameter)
         if not parts:
-            raise InputError("no part is given to make the scene for")
+            raise InputError("no object is given to make the scene for")
         smallest, ratio = parts[0], parts[-1].in_unit("m").diameter / parts[0].in_unit("m").diameter
         read, truth, bop_ids = _read(scan, unit, camera, smallest)
         size = scene_size(read)
@@ -193,7 +193,7 @@ class PoseEstimator:
             return ()
         for one in parts:
             if one.model_digest != self.digest:
-                raise InputError(f"the part {one.name} was prepared with other weights: prepare it with this estimator")
+                raise InputError(f"the object {one.name} was prepared with other weights: prepare it with this estimator")
         if not 0 <= random_seed <= _MOST_SEED:
             raise InputError(f"random_seed is {random_seed}, but must be between 0 and {_MOST_SEED}")
         clock = clock or Clock()
@@ -238,7 +238,7 @@ def _check_near(scene: Scene, places: Float[np.ndarray, "k 3"], reach: float) ->
         if away > reach:
             raise InputError(
                 f"place {number + 1} to search at is {away:.4g} {scene.unit} away from the nearest measured point,"
-                " farther than the part is large: give a point of the scan"
+                " farther than the object is large: give a point of the scan"
             )
 
 
@@ -280,11 +280,11 @@ def _object(source: PartSource, unit: str | None, name: str | None) -> ObjectMod
         if hasattr(source, "vertices") and hasattr(source, "faces"):
             source = (source.vertices, source.faces)
         if not isinstance(source, tuple) or len(source) != 2:
-            raise InputError(f"a part cannot be made of a {type(source).__name__}: give a file, a cloud or a mesh")
+            raise InputError(f"an object cannot be made of a {type(source).__name__}: give a file, a cloud or a mesh")
         vertices, triangles = (np.asarray(array) for array in source)
         return object_from_mesh(name, vertices.astype(np.float64), triangles.astype(np.int64), unit, config)
     cloud = np.asarray(source)
     if cloud.ndim != 2 or cloud.shape[1] not in (3, 6):
-        raise InputError(f"the part's cloud has shape {cloud.shape}, but must be (n, 3), or (n, 6) with normals")
+        raise InputError(f"the object's cloud has shape {cloud.shape}, but must be (n, 3), or (n, 6) with normals")
     normals = cloud[:, 3:].astype(np.float64) if cloud.shape[1] == 6 else None
     return object_from_cloud(name, cloud[:, :3].astype(np.float64), normals, unit, config)

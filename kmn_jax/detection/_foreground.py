@@ -106,7 +106,7 @@ def foreground(
             kept[chosen] = height < -margin
             if not kept.any():
                 raise InputError(
-                    f"all {len(chosen)} points lie in one plane or behind it: if they show parts, keep the plane"
+                    f"all {len(chosen)} points lie in one plane or behind it: if they show objects, keep the plane"
                 )
         warnings += [warning] if warning else []
         chosen = np.flatnonzero(kept)

@@ -150,10 +150,10 @@ def check_triangles(vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarra
     if bad.any():
         raise InputError(
             f"{bad.sum()} of {len(bad)} vertices are NaN, infinite or beyond {_FARTHEST:g}, the first is number"
-            f" {int(bad.argmax())}: export the part again"
+            f" {int(bad.argmax())}: export the object again"
         )
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(vertices)):
         raise InputError(
             f"triangles name vertices from {triangles.min()} to {triangles.max()}, but there are 0 to"
-            f" {len(vertices) - 1}: export the part again"
+            f" {len(vertices) - 1}: export the object again"
         )

@@ -230,7 +230,7 @@ def _model(
 def _refuse_flat(points: Float[np.ndarray, "n 3"]) -> None:
     offsets = points - points.mean(axis=0)
     if np.linalg.matrix_rank(offsets, tol=1e-6 * float(np.linalg.norm(offsets))) < 3:
-        raise InputError("all points lie in one plane or on a line: that is not a part's surface")
+        raise InputError("all points lie in one plane or on a line: that is not an object's surface")
 
 
 def _covered_area(points: Float[np.ndarray, "n 3"]) -> float:

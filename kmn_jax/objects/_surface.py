@@ -63,7 +63,7 @@ def outer_surface(
     owner, point, count = (np.concatenate(parts) for parts in zip(*samples, strict=True))
     seen = count.max(axis=1) >= _MIN_ESCAPES
     if seen.sum() < num_points:
-        raise InputError(f"only {seen.mean():.0%} of the mesh can be seen from outside: that is not a part's surface")
+        raise InputError(f"only {seen.mean():.0%} of the mesh can be seen from outside: that is not an object's surface")
 
     total = np.zeros((len(triangles), 2), np.int64)
     np.add.at(total, owner, count)
@@ -152,7 +152,7 @@ def _without_degenerate(
     kept = triangles[real]
     if len(kept) < 2:
         raise InputError(
-            f"the mesh has {len(kept)} triangles with an area (of {len(triangles)}): a part's surface needs more"
+            f"the mesh has {len(kept)} triangles with an area (of {len(triangles)}): an object's surface needs more"
         )
     used, renumbered = np.unique(kept, return_inverse=True)
     return vertices[used].astype(np.float64), renumbered.reshape(-1, 3).astype(np.int32)

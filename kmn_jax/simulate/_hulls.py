@@ -114,7 +114,7 @@ def triangle_corners(
         raise InputError(f"triangles name vertices from {triangles.min()} to {triangles.max()} of {len(vertices)}")
     corners = vertices[triangles]
     if not np.isfinite(corners).all():
-        raise InputError("the surface has vertices that are NaN or infinite: export the part again")
+        raise InputError("the surface has vertices that are NaN or infinite: export the object again")
     return corners
 
 

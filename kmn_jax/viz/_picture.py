@@ -82,7 +82,7 @@ def save_picture(
     panels.draw_keypoints(figure.add_subplot(grid[1, 0]))
     panels.draw_poses(figure.add_subplot(grid[1, 1]))
     side = grid[:, 2].subgridspec(3, 1, height_ratios=(1, 1, 2.4))
-    draw_part(figure.add_subplot(side[0]), part, (0.5, 0.6, -0.62), "The part's keypoints")
+    draw_part(figure.add_subplot(side[0]), part, (0.5, 0.6, -0.62), "The object's keypoints")
     draw_part(figure.add_subplot(side[1]), part, (-0.5, -0.6, 0.62), "from behind")
     draw_list(figure.add_subplot(side[2]), found)
     content = io.BytesIO()

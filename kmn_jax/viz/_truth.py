@@ -12,10 +12,10 @@ from kmn_jax.objects import Part
 
 TRUTH_COLORS = {
     "background, taken for background": (1.0, 1.0, 1.0),
-    "background, taken for the part": (0.85, 0.10, 0.10),
-    "part, taken for background": (0.98, 0.83, 0.05),
-    "part, but keypoint wrong": (0.15, 0.30, 0.95),
-    "part, and keypoint right": (0.10, 0.70, 0.20),
+    "background, taken for the object": (0.85, 0.10, 0.10),
+    "object, taken for background": (0.98, 0.83, 0.05),
+    "object, but keypoint wrong": (0.15, 0.30, 0.95),
+    "object, and keypoint right": (0.10, 0.70, 0.20),
 }
 """Colours in [0, 1] by what a point of a crop is and was taken for; `truth_codes` returns rows of it."""
 BACKGROUND, FALSE_PART, MISSED, WRONG_KEYPOINT, RIGHT = range(5)  # the rows of TRUTH_COLORS

@@ -26,11 +26,11 @@ _PICK, _CANCEL = "Pick a point to search at", "Cancel picking"
 _LAYERS = {  # what can be switched: whether it is shown at first, and what it is
     "Scan": (True, "the measured points"),
     "Depth colours": (False, "colour the scan by depth: yellow is near"),
-    "Surfaces": (True, "the part at its poses"),
+    "Surfaces": (True, "the object at its poses"),
     "Labels": (True, "rank and probability"),
-    "Axes": (False, "the part's frames: x red, y green, z blue"),
-    "Segmentation": (False, "points around the seeds: in the pose's colour if taken for the part, else dark"),
-    "Keypoints": (False, "points taken for the part, in the colours of their likeliest keypoints"),
+    "Axes": (False, "the object's frames: x red, y green, z blue"),
+    "Segmentation": (False, "points around the seeds: in the pose's colour if taken for the object, else dark"),
+    "Keypoints": (False, "points taken for the object, in the colours of their likeliest keypoints"),
 }
 
 

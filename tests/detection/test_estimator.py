@@ -181,7 +181,7 @@ def test_what_cannot_be_is_one_sentence(estimator: PoseEstimator, motor: Part, t
         estimator.detect(motor, scan, sensor=np.zeros(3))
     with pytest.raises(InputError, match="were settled when the scene was made"):
         estimator.detect(motor, estimator.scene(scan, motor), unit="mm")
-    with pytest.raises(InputError, match="no part is given"):
+    with pytest.raises(InputError, match="no object is given"):
         estimator.scene(scan, [])
     save_part(motor, tmp_path / "motor.kmn")
     assert estimator.prepare(tmp_path / "motor.kmn", "mm").unit == "mm"

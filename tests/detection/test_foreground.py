@@ -149,7 +149,7 @@ def test_a_single_plane_is_not_thrown_away_unasked() -> None:
     kept, (warning,) = foreground(scan, DIAMETER)
     assert kept.all()
     assert "of the points was kept, as only 0.0% lie in front of it" in warning
-    with pytest.raises(InputError, match="lie in one plane or behind it: if they show parts, keep the plane"):
+    with pytest.raises(InputError, match="lie in one plane or behind it: if they show objects, keep the plane"):
         foreground(scan, DIAMETER, ForegroundOptions(remove_plane="always"))
 
 
