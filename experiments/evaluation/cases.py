@@ -14,6 +14,7 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
+from kmn_jax.detection import MOST_POINTS
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import PaddedCloud, pad_cloud
 from kmn_jax.objects import ObjectModel
@@ -23,7 +24,7 @@ _SEED_DRAWS = 5000  # points of a scan whose copy is looked for
 _LABEL_TOLERANCE = 0.02  # of the diameter: a point belongs to the copy whose surface is so near
 _LEAST_VISIBLE = 0.1  # of a copy, where it is known
 _LEAST_POINTS = 50  # of a crop
-_LEAST_PADDED, _MOST_PADDED = 16_384, 32_768  # of a padded crop; more are thinned out at random
+_LEAST_PADDED = 16_384  # of a padded crop; more than a scene has are thinned out at random, as there
 
 
 @dataclass(frozen=True)
@@ -178,7 +179,7 @@ def limited(objects: Sequence[ObjectImages], names: Sequence[str]) -> list[Objec
 
 def padded(points: Float32[np.ndarray, "n 3"]) -> PaddedCloud:
     """Return a crop in a capacity of few possible ones, its first point still the first."""
-    if len(points) > _MOST_PADDED:
-        rows = 1 + np.random.default_rng(0).choice(len(points) - 1, _MOST_PADDED - 1, replace=False)
+    if len(points) > MOST_POINTS:
+        rows = 1 + np.random.default_rng(0).choice(len(points) - 1, MOST_POINTS - 1, replace=False)
         points = points[np.concatenate([[0], np.sort(rows)])]
     return pad_cloud(points, _LEAST_PADDED)

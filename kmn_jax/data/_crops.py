@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from kmn_jax.errors import InputError
 from kmn_jax.geometry import SmoothConfig, draw_rows, nearest, orient_to_camera, transform_points, with_normals
 from kmn_jax.simulate import BIN, VisiblePoints
 from kmn_jax.typing import Pose, PRNGKey, Scalar
@@ -42,20 +43,20 @@ class CropConfig:
 
     def __post_init__(self) -> None:
         if not 1 <= self.min_points <= self.num_points:
-            raise ValueError(f"min_points = {self.min_points} must lie between 1 and num_points = {self.num_points}")
+            raise InputError(f"min_points = {self.min_points} must lie between 1 and num_points = {self.num_points}")
         if self.radius <= 0 or self.max_noise < 0:
-            raise ValueError(
+            raise InputError(
                 f"radius = {self.radius} must be above zero, and max_noise = {self.max_noise} not below it"
             )
         if self.normals not in ("estimated", "surface"):
-            raise ValueError(f'normals = "{self.normals}", but must be "estimated" or "surface"')
+            raise InputError(f'normals = "{self.normals}", but must be "estimated" or "surface"')
         if self.normal_radius <= 0 or self.normal_points < 3:
-            raise ValueError(
+            raise InputError(
                 f"normal_radius = {self.normal_radius} must be above zero"
                 f" and normal_points = {self.normal_points} at least 3"
             )
         if not 0 <= self.instance_seeds <= 1:
-            raise ValueError(f"instance_seeds = {self.instance_seeds} is a share: it must be between 0 and 1")
+            raise InputError(f"instance_seeds = {self.instance_seeds} is a share: it must be between 0 and 1")
 
     @property
     def num_drawn(self) -> int:
@@ -165,7 +166,7 @@ def labelled_crop_around(
 
 def _check_points(visible: VisiblePoints) -> None:
     if visible.mask.shape[0] < 1:
-        raise ValueError("visible holds no points: a scene needs at least one copy and one surfel")
+        raise InputError("visible holds no points: a scene needs at least one copy and one surfel")
 
 
 def _draw_seed(key: PRNGKey, visible: VisiblePoints, config: CropConfig) -> tuple[Int[Array, ""], Bool[Array, ""]]:

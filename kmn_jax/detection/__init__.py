@@ -48,7 +48,7 @@ from kmn_jax.detection._mapping import call_rows, map_real, map_rows
 from kmn_jax.detection._outline import OutlineAgreement, outline_agreement
 from kmn_jax.detection._output import as_json, table, write_bop_csv, write_json
 from kmn_jax.detection._result import CropPrediction, Detection, Detections, Timing
-from kmn_jax.detection._scene import Scene, make_scene
+from kmn_jax.detection._scene import MOST_POINTS, Scene, make_scene
 from kmn_jax.detection._search import (
     Candidates,
     SearchConfig,
@@ -66,6 +66,7 @@ from kmn_jax.detection._timing import Clock
 
 __all__ = [
     "EVIDENCE",
+    "MOST_POINTS",
     "NUM_SEEDS",
     "SIGNS",
     "THOROUGH",

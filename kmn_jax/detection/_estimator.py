@@ -193,7 +193,9 @@ class PoseEstimator:
             return ()
         for one in parts:
             if one.model_digest != self.digest:
-                raise InputError(f"the object {one.name} was prepared with other weights: prepare it with this estimator")
+                raise InputError(
+                    f"the object {one.name} was prepared with other weights: prepare it with this estimator"
+                )
         if not 0 <= random_seed <= _MOST_SEED:
             raise InputError(f"random_seed is {random_seed}, but must be between 0 and {_MOST_SEED}")
         clock = clock or Clock()

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from kmn_jax.errors import InputError
+
 _COORDINATES = 3
 _CPU_PARTS = 32  # fewer than about ten ready operations XLA's CPU runtime keeps on one thread
 _CPU_ROWS = 16  # for fewer rows, fewer parts: these take longer to compile than they save
@@ -72,7 +74,7 @@ def neighbor_graph(points: Float[Array, "n c"], k: int, mask: Bool[Array, " n"] 
 
 def _check_k(k: int, count: int) -> None:
     if not 1 <= k <= count:
-        raise ValueError(f"k = {k} neighbours asked of {count} points: choose k between 1 and their number")
+        raise InputError(f"k = {k} neighbours asked of {count} points: choose k between 1 and their number")
 
 
 def _repeat_nearest(values: Float[Array, "n k"], indices: Int[Array, "n k"]) -> Int[Array, "n k"]:

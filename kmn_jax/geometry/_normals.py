@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from kmn_jax.errors import positive_scalar
+from kmn_jax.errors import InputError, positive_scalar
 from kmn_jax.geometry._eigen import dominant_eigenvector
 from kmn_jax.geometry._knn import k_nearest
 from kmn_jax.geometry._rows import real_rows
@@ -34,9 +34,9 @@ def estimate_normals(
     """
     total = points.shape[0]
     if total < 1:
-        raise ValueError("points is empty, so there is nothing to take normals of")
+        raise InputError("points is empty, so there is nothing to take normals of")
     if k < 3:
-        raise ValueError(f"k = {k} neighbours define no plane: choose at least 3")
+        raise InputError(f"k = {k} neighbours define no plane: choose at least 3")
     radius = jnp.inf if max_radius is None else positive_scalar(max_radius, "max_radius").astype(jnp.float32)
     real = real_rows(points, mask)
     centred = jnp.where(real[:, None], points, 0).astype(jnp.float32)
@@ -99,7 +99,7 @@ def depth_normals(
     pixels are fewer than three or on a line. Raises ValueError for a window_radius below 1.
     """
     if window_radius < 1:
-        raise ValueError(f"window_radius = {window_radius} leaves one pixel and no plane: choose at least 1")
+        raise InputError(f"window_radius = {window_radius} leaves one pixel and no plane: choose at least 1")
     height, width = depth.shape
     real = _has_depth(depth)
     points = list(jnp.moveaxis(depth_to_points(depth, intrinsics).astype(jnp.float32), -1, 0))

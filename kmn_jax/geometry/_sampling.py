@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from kmn_jax.errors import InputError
 from kmn_jax.geometry._rows import real_rows
 from kmn_jax.typing import PRNGKey, Scalar
 
@@ -28,7 +29,7 @@ def farthest_point_indices(
     """
     total = points.shape[0]
     if not 1 <= count <= total:
-        raise ValueError(f"count = {count} of {total} points cannot be chosen: take a count between 1 and their number")
+        raise InputError(f"count = {count} of {total} points cannot be chosen: take a count between 1 and their number")
     real = real_rows(points, mask)
     x, y, z = jnp.where(real[:, None], points, 0).T
     available = jnp.where(real, jnp.inf, _PADDING).astype(points.dtype)

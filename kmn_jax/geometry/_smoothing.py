@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from kmn_jax.errors import InputError
 from kmn_jax.geometry._ball_normals import normals_within_radius, planes_within_radius
 from kmn_jax.geometry._normals import orient_to_camera
 from kmn_jax.typing import Scalar
@@ -31,13 +32,13 @@ class SmoothConfig:
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
         if not 0 < self.least_radius <= self.most_radius:
-            raise ValueError(
+            raise InputError(
                 f"least_radius = {self.least_radius} must be above zero, and most_radius = {self.most_radius} not below"
             )
         if self.radius_per_noise < 0 or self.probe_radius <= 0 or self.moved_noise <= 0:
-            raise ValueError("radius_per_noise must not be negative, probe_radius and moved_noise be above zero")
+            raise InputError("radius_per_noise must not be negative, probe_radius and moved_noise be above zero")
         if self.probes < 1 or not 0 <= self.quantile <= 1:
-            raise ValueError(f"probes = {self.probes} must be 1 or more, and quantile = {self.quantile} in [0, 1]")
+            raise InputError(f"probes = {self.probes} must be 1 or more, and quantile = {self.quantile} in [0, 1]")
 
 
 def smoothed(

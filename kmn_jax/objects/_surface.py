@@ -63,7 +63,9 @@ def outer_surface(
     owner, point, count = (np.concatenate(parts) for parts in zip(*samples, strict=True))
     seen = count.max(axis=1) >= _MIN_ESCAPES
     if seen.sum() < num_points:
-        raise InputError(f"only {seen.mean():.0%} of the mesh can be seen from outside: that is not an object's surface")
+        raise InputError(
+            f"only {seen.mean():.0%} of the mesh can be seen from outside: that is not an object's surface"
+        )
 
     total = np.zeros((len(triangles), 2), np.int64)
     np.add.at(total, owner, count)

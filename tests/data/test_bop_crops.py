@@ -15,8 +15,8 @@ from kmn_jax.data import (
     BatchIterator,
     BopCropConfig,
     BopCrops,
-    Crop,
     CropConfig,
+    LabelledCrop,
     PipelineConfig,
     SampleBatches,
     load_models,
@@ -76,8 +76,8 @@ def batches(crops: BopCrops, ordered: bool = False) -> SampleBatches:
     return SampleBatches(config, len(crops.keys), 1, ordered=ordered)
 
 
-def single(batch: FrameCrops, row: int) -> Crop:
-    crop: Crop = jax.tree.map(lambda part: part[row], batch.crop)
+def single(batch: FrameCrops, row: int) -> LabelledCrop:
+    crop: LabelledCrop = jax.tree.map(lambda part: part[row], batch.crop)
     return crop
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.data import Crop, CropConfig, draw_crop
+from kmn_jax.data import CropConfig, LabelledCrop, draw_crop
 from kmn_jax.simulate import BIN, VisiblePoints
 from tests.reference.meshes import pose, random_rotations
 
@@ -46,15 +46,15 @@ def scene(seed: int = 0, share: float = 0.6, **changes: Any) -> VisiblePoints:
     return VisiblePoints(**{name: jnp.asarray(value) for name, value in fields.items()})
 
 
-def crop_of(seed: int, visible: VisiblePoints, config: CropConfig) -> Crop:
+def crop_of(seed: int, visible: VisiblePoints, config: CropConfig) -> LabelledCrop:
     return draw(jax.random.key(seed), visible, KEYPOINTS, POSES, jnp.float32(DIAMETER), config)
 
 
-def plain(crop: Crop) -> dict[str, np.ndarray]:
+def plain(crop: LabelledCrop) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in crop._asdict().items()}
 
 
-def all_finite(crop: Crop) -> bool:
+def all_finite(crop: LabelledCrop) -> bool:
     return all(bool(jnp.isfinite(part).all()) for part in crop)
 
 
@@ -303,7 +303,7 @@ def test_vmap_equals_single_crops(config: CropConfig) -> None:
     )(keys, stacked)
     for i in range(3):
         alone = crop_of(i, scenes[i], config)
-        for name, part, expected in zip(Crop._fields, batched, alone, strict=True):
+        for name, part, expected in zip(LabelledCrop._fields, batched, alone, strict=True):
             # A neighbour at the very boundary may count or not, which turns a normal.
             share = 0.01 if name == "normals" and config is NOISY else 0.0
             close = np.isclose(np.asarray(part[i]), np.asarray(expected), atol=2e-3 if share else 1e-5)

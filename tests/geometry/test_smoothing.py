@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.data import CropConfig, crop_around
-from kmn_jax.detection import SceneArrays
-from kmn_jax.detection._scan_crop import as_visible
-from kmn_jax.geometry import SmoothConfig, smoothed
+from kmn_jax.errors import InputError
+from kmn_jax.geometry import SmoothConfig, smoothed, with_normals
 
 smooth = jax.jit(smoothed, static_argnames="config")
 
@@ -95,26 +92,20 @@ def test_padding_counts_nowhere() -> None:
     assert float(found[3]) == pytest.approx(float(plain[3]), rel=1e-3)
 
 
-def test_a_smoothed_crop_starts_at_its_own_seed() -> None:
+def test_points_with_normals_are_smoothed_and_face_the_camera() -> None:
     points, normal = tilted_plane(4000, 0.04)
-    points += np.float32([0, 0, 6])
-    scene = SceneArrays(jnp.asarray(points), jnp.ones(4000, dtype=bool))
-    crop = crop_around(
-        jax.random.key(0),
-        as_visible(scene),
-        jnp.int32(0),
-        jnp.bool_(True),
-        jnp.zeros((1, 3)),
-        jnp.eye(4)[None],
-        jnp.float32(1),
-        CropConfig(num_points=256, max_noise=0.0, smooth=SmoothConfig()),
-    )
-    np.testing.assert_array_equal(crop.points[0], 0)
-    centre = np.float32([0, 0, 6])
-    assert abs((np.asarray(crop.seed) - centre) @ normal) < 0.03
-    spread = ((np.asarray(crop.points) + np.asarray(crop.seed) - centre) @ normal).std()
+    shown = points + np.float32([0, 0, 6])
+    there = np.ones(4000, dtype=bool)
+    camera, mask = np.zeros(3, dtype=np.float32), np.arange(256) < 250
+    given = (shown[:256], mask, shown, there, camera, np.float32(1), 0.06)
+    moved, normals = jax.jit(with_normals, static_argnums=(6, 7))(*given, SmoothConfig())
+    spread = ((np.asarray(moved)[mask] - [0, 0, 6]) @ normal).std()
     assert spread < 0.025  # of 0.04
-    np.testing.assert_allclose(np.linalg.norm(crop.normals, axis=1)[np.asarray(crop.mask)], 1, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), mask, atol=1e-5)
+    assert ((np.asarray(normals) * np.asarray(moved)).sum(axis=1)[mask] < 0).all()
+    plain, rough = jax.jit(with_normals, static_argnums=(6, 7))(*given, None)
+    np.testing.assert_array_equal(plain, shown[:256])
+    np.testing.assert_allclose(np.linalg.norm(rough, axis=1), mask, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -130,5 +121,5 @@ def test_a_smoothed_crop_starts_at_its_own_seed() -> None:
     ],
 )
 def test_settings_without_meaning_are_refused(values: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=next(iter(values))):
+    with pytest.raises(InputError, match=next(iter(values))):
         SmoothConfig(**values)  # type: ignore[arg-type]

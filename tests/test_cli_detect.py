@@ -1,4 +1,4 @@
-"""`kmn prepare` and `kmn estimate` as a user calls them: files in, files out, one sentence for bad input."""
+"""`kmn prepare` and `kmn detect` as a user calls them: files in, files out, one sentence for bad input."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_bin_in_all_forms_of_output(card: Path, tmp_path: Path, capsys: pytest
     arguments = [str(part) for pair in outputs.items() for part in pair]
     code = main(
         [
-            "estimate",
+            "detect",
             "--object",
             str(card),
             "--scene",
@@ -83,10 +83,10 @@ def table(path: Path) -> list[dict[str, str]]:
 def test_a_cloud_around_a_point(card: Path, cloud: Path, tmp_path: Path) -> None:
     target = tmp_path / "b.json"
     place = ",".join(f"{x:.3f}" for x in np.load(cloud)[100])
-    assert main(["estimate", "--object", str(card), "--scene", str(cloud), "--at", place, "--json", str(target)]) == 0
+    assert main(["detect", "--object", str(card), "--scene", str(cloud), "--at", place, "--json", str(target)]) == 0
     assert json.loads(target.read_text())["seed"] == 0
     both = ["--at", place, "--at", ",".join(f"{x:.3f}" for x in np.load(cloud)[2000])]
-    assert main(["estimate", "--object", str(card), "--scene", str(cloud), *both, "--json", str(target)]) == 0
+    assert main(["detect", "--object", str(card), "--scene", str(cloud), *both, "--json", str(target)]) == 0
 
 
 def test_a_relative_path_and_another_part(
@@ -94,7 +94,7 @@ def test_a_relative_path_and_another_part(
 ) -> None:
     monkeypatch.chdir(IMAGE.parent)
     target = tmp_path / "a.csv"
-    code = main(["estimate", "--object", str(SHAFT), "--scene", IMAGE.name, "--bop-csv", str(target)])
+    code = main(["detect", "--object", str(SHAFT), "--scene", IMAGE.name, "--bop-csv", str(target)])
     assert code == 0, capsys.readouterr().err
     assert {row["obj_id"] for row in table(target)} <= {"1"}  # not that of the motor, which is 2
 
@@ -124,7 +124,7 @@ def test_bad_input_is_one_sentence_and_exit_2(
         ({"--at": "1,2"}, "--at"),
         ({"--roi": "1,2,3,0,0,0"}, "roi"),
         ({"--top": "0"}, "top"),
-        ({"--seed": str(2**63)}, "seed"),
+        ({"--random-seed": str(2**63)}, "seed"),
         ({"--save-picture": str(tmp_path / "a.jpg")}, "PNG"),
         ({"--at": "9000,9000,9000"}, "away from the nearest measured point"),
         ({"--json": str(tmp_path / "missing" / "a.json")}, "folder does not exist"),
@@ -132,7 +132,7 @@ def test_bad_input_is_one_sentence_and_exit_2(
     ]
     for changes, message in cases:
         arguments = [part for pair in (whole | changes).items() for part in pair]
-        assert main(["estimate", *arguments]) == 2, changes
+        assert main(["detect", *arguments]) == 2, changes
         error = capsys.readouterr().err
         assert error.startswith("kmn: ")
         assert message in error, error
@@ -152,5 +152,5 @@ def test_a_killed_command_leaves_no_half_written_file(tmp_path: Path) -> None:
         visible = [path for path in tmp_path.iterdir() if not path.name.startswith(".")]
         assert visible in ([], [target])
         if visible:
-            assert main(["estimate", "--object", str(target), "--scene", os.devnull]) == 2  # readable: the scene is not
+            assert main(["detect", "--object", str(target), "--scene", os.devnull]) == 2  # readable: the scene is not
             target.unlink()
