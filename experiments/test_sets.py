@@ -28,8 +28,8 @@ from kmn_jax.simulate import PERFECT, RayMesh, SensorConfig, collision_shape
 ASSETS = Path(__file__).parent / "assets"
 DIGESTS = ASSETS / "test_sets.json"
 SPLIT = "test"
-CONFIG = PackConfig(seed=1)  # another seed than the training pack's
-VALIDATION_CONFIG = PackConfig(seed=2, drops=6)
+CONFIG = PackConfig(random_seed=1)  # another seed than the training pack's
+VALIDATION_CONFIG = PackConfig(random_seed=2, drops=6)
 _LIBRARIES = ("cascadio", "jax", "mujoco", "numpy", "open3d", "scipy", "trimesh")
 
 

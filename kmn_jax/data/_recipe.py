@@ -48,7 +48,7 @@ class PackConfig:
     hulls: HullConfig = field(default_factory=HullConfig)
     bins: BinConfig = field(default_factory=BinConfig)
     cameras: CameraConfig = field(default_factory=CameraConfig)
-    seed: int = 0
+    random_seed: int = 0
 
     def __post_init__(self) -> None:
         if self.surfels < 8 or self.surfels % 8 or self.bin_surfels < 8 or self.bin_surfels % 8:
@@ -85,7 +85,7 @@ def pack_object(
     """
     clock = _Clock()
     with clock("model"):
-        model = load_object(path, config=ObjectConfig(num_points=config.surfels, seed=config.seed)).in_unit("m")
+        model = load_object(path, config=ObjectConfig(num_points=config.surfels, seed=config.random_seed)).in_unit("m")
     with clock("hulls"):
         shape = collision_shape(model.vertices, model.triangles, config.hulls)
     mesh = RayMesh(model.vertices, model.triangles)
@@ -114,14 +114,14 @@ def bin_scenes(shape: CollisionShape, config: PackConfig, object_seed: int) -> t
     """Drop copies into bins as the recipe says and put a camera above each. Raises InputError where one fails."""
     scenes, results = [], []
     for index, copies in enumerate(config.copies_per_drop.tolist()):
-        seed = (config.seed, object_seed, index)
-        result = settle(shape, copies, config.bins, seed)
+        random_seed = (config.random_seed, object_seed, index)
+        result = settle(shape, copies, config.bins, random_seed)
         if not result.accepted:
             raise InputError(
                 f"{copies} copies found no acceptable rest in {result.attempts} attempts: {result.rejected[-1]}"
             )
         camera, T_camera_bin = place_camera(
-            result.bin, shape.diagonal, config.cameras, np.random.default_rng((*seed, 1))
+            result.bin, shape.diagonal, config.cameras, np.random.default_rng((*random_seed, 1))
         )
         scenes.append(BinScene(result.bin, result.T_bin_object, camera, T_camera_bin))
         results.append(result)

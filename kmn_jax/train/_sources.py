@@ -55,7 +55,7 @@ def training_source(config: TrainConfig, mesh: Mesh, report: Report = ignore) ->
 def validation_source(config: TrainConfig, mesh: Mesh, report: Report = ignore) -> Source:
     """Return the validation objects and their fixed samples, in order, as one pass; see `training_source`."""
     stacked = stack_pack(Pack(config.pack), "validation", _with_bits(config))
-    pipeline = replace(config.pipeline, samples_per_object=config.validation_samples, seed=_VALIDATION_SEED)
+    pipeline = replace(config.pipeline, samples_per_object=config.validation_samples, random_seed=_VALIDATION_SEED)
     return _source(config, stacked, pipeline, mesh, report, ordered=True)
 
 

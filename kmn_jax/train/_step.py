@@ -31,7 +31,7 @@ class StepConfig:
     crops_per_object: int  # consecutive samples of a batch that share an object, and its encoding
     crops_at_once: int | None  # that a device computes side by side, the rest one after the other; None: all
     average_decay: float  # of the running mean of the parameters, which is what is evaluated and shipped
-    seed: int
+    random_seed: int
 
     def __post_init__(self) -> None:
         if not 0 <= self.average_decay < 1:
@@ -92,7 +92,7 @@ SumGradients: TypeAlias = Callable[[nnx.State, DevicePack, Samples, Array], tupl
 
 def create_state(config: StepConfig, optimizer: optax.GradientTransformation) -> tuple[nnx.GraphDef, TrainState]:
     """Return the network's structure and the state before the first step."""
-    graphdef, parameters = create_model(config.network, jax.random.key(config.seed))
+    graphdef, parameters = create_model(config.network, jax.random.key(config.random_seed))
     state = TrainState(jnp.int32(0), parameters, jax.tree.map(jnp.copy, parameters), optimizer.init(parameters))
     return graphdef, state
 
@@ -114,7 +114,7 @@ def train_step(
     `spread` may have the sums over the batch computed by several devices.
     """
     groups = index_of(samples).object.shape[0] // config.crops_per_object
-    dropout = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.step), groups)
+    dropout = jax.random.split(jax.random.fold_in(jax.random.key(config.random_seed), state.step), groups)
     grads, sums = spread(partial(sum_gradients, graphdef, config))(state.parameters, pack, samples, dropout)
     count = jnp.maximum(sums.num_crops, 1)
     grads = jax.tree.map(lambda leaf: leaf / count, grads)
