@@ -155,7 +155,7 @@ def _make(folder: str, source: Source, config: PackConfig) -> Record:
     except InputError as error:
         return Record(source.name, source.split, time.perf_counter() - start, str(error), None, None)
     entry = write_object(folder, item)
-    return Record(source.name, source.split, time.perf_counter() - start, None, entry, asdict(facts))
+    return Record(source.name, source.split, time.perf_counter() - start, None, entry, facts)
 
 
 class _Journal:

@@ -200,7 +200,7 @@ class BatchIterator(Generic[_T]):
 
         self._facts = {"identity": identity, **batches.facts}
         options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=ahead if threads else 0)
-        # Whole batches are its elements: grain takes 0.1 ms for each, and its own shuffle milliseconds on short sources.
+        # Whole batches are its elements: grain takes 0.1 ms for each, its own shuffle milliseconds on short sources.
         dataset = grain.MapDataset.source(batches)
         self._iterator = iter((dataset if make is None else dataset.map(make)).to_iter_dataset(options))
         self._length, self.next_batch = len(batches), 0

@@ -272,14 +272,8 @@ class _Run:
     def _write(self, step: int, split: str, values: dict[str, float]) -> None:
         if self.first:
             seen = step * self.config.pipeline.batch_size
-            row: dict[str, float | str] = {
-                "step": step,
-                "samples": seen,
-                "split": split,
-                **values,
-                "seconds": self._seconds(),
-            }
-            add_metrics(self.folder, row)
+            facts: dict[str, float | str] = {"step": step, "samples": seen, "split": split}
+            add_metrics(self.folder, {**facts, **values, "seconds": self._seconds()})
 
     def _seconds(self) -> float:
         return self.seconds_before + time.monotonic() - self.began

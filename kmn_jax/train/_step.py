@@ -197,10 +197,7 @@ def make_samples(config: StepConfig, pack: DevicePack, samples: Samples) -> Grou
 class _Chunk(NamedTuple):
     """Groups that are computed side by side: c of them, g samples each."""
 
-    row: Int[Array, " c"]
-    drops: Int[Array, "c g"]
-    keys: UInt32[Array, "c g 2"]
-    counted: Bool[Array, "c g"]
+    which: SampleIndex  # (c, g) in place of (b,)
     rendered: RenderedCrops | None
     dropout: PRNGKey | None
 
@@ -225,11 +222,9 @@ def _chunks(samples: Samples, dropout: Key[Array, " groups"] | None, config: Ste
     if size % each or groups % at_once:
         raise InputError(f"a batch of {size} must hold whole chunks of {at_once} groups of crops_per_object = {each}")
     shape = (groups // at_once, at_once, each)
-    rows, drops, counted = (jnp.asarray(array).reshape(shape) for array in (index.object, index.drop, index.mask))
-    keys = jnp.asarray(index.key).reshape(*shape, 2)
-    crops = samples.crops if isinstance(samples, RenderedSamples) else None
-    rendered = jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(*shape, *leaf.shape[1:]), crops)
-    return _Chunk(rows[..., 0], drops, keys, counted, rendered, None if dropout is None else dropout.reshape(shape[:2]))
+    rendered = samples.crops if isinstance(samples, RenderedSamples) else None
+    index, rendered = jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(*shape, *leaf.shape[1:]), (index, rendered))
+    return _Chunk(index, rendered, None if dropout is None else dropout.reshape(shape[:2]))
 
 
 def index_of(samples: Samples) -> SampleIndex:
@@ -245,7 +240,8 @@ def _make(pack: DevicePack, chunk: _Chunk, config: StepConfig, examples: Example
     ) -> Group:
         return make_group(pack, row, drops, keys, config.network, examples, rendered)
 
-    return jax.lax.stop_gradient(jax.vmap(one)(chunk.row, chunk.drops, chunk.keys, chunk.rendered))
+    rows, drops, keys = (jnp.asarray(array) for array in chunk.which[:3])
+    return jax.lax.stop_gradient(jax.vmap(one)(rows[:, 0], drops, keys, chunk.rendered))
 
 
 def _dropout_keys(
@@ -262,7 +258,7 @@ def _parts(groups: Group, chunk: _Chunk, keys: Key[Array, "c g"] | None, config:
     """Split the crops of a chunk's groups into parts along a new first axis."""
     each = config.crops_per_object
     at_once = min(config.crops_at_once or each, each)
-    weight = (groups.valid & chunk.counted).astype(jnp.float32)
+    weight = (groups.valid & chunk.which.mask).astype(jnp.float32)
     whole = _Part(groups.crops, groups.mask, groups.is_object, groups.keypoint, weight, keys)
 
     def split(array: Array) -> Array:
