@@ -40,7 +40,6 @@ from kmn_jax.train._sharding import (
     jit_eval_step,
     jit_train_step,
     put_batch,
-    put_number,
     put_whole,
 )
 from kmn_jax.train._snapshot import Snapshot
@@ -212,7 +211,7 @@ class _Run:
     def _advance(self) -> None:
         state, samples = self.batches.get_state(), next(self.batches)
         with jax.transfer_guard("disallow"):
-            number = put_number(self.step, self.mesh)
+            number = put_whole(np.int32(self.step), self.mesh)
             batch = put_batch(samples, self.mesh)
             self.state, metrics = self.train_step(self.state, self.training.pack, batch, number)
             vote = any_process(bool(self.stop.reason), self.mesh)

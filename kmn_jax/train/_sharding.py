@@ -13,7 +13,6 @@ from functools import lru_cache, partial
 from typing import Any, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jax.experimental import multihost_utils
@@ -36,7 +35,7 @@ from kmn_jax.train._step import (
     train_step,
 )
 
-TrainStep = Callable[[TrainState, DevicePack, Samples, Int[Array, ""]], tuple[TrainState, Metrics]]
+TrainStep = Callable[[TrainState, DevicePack, Samples, Int[Array, ""] | np.int32], tuple[TrainState, Metrics]]
 EvalStep = Callable[[nnx.State, DevicePack, Samples], Sums]
 
 _AXIS = "data"
@@ -153,11 +152,6 @@ def jit_make_samples(config: StepConfig, mesh: Mesh) -> Callable[[DevicePack, Sa
 def put_whole(tree: _T, mesh: Mesh) -> _T:
     """Put arrays, the same in all processes, on every device."""
     return _put(tree, _shardings(mesh)[0])
-
-
-def put_number(value: int, mesh: Mesh) -> Int[Array, ""]:
-    """Put a whole number on every device."""
-    return jnp.asarray(_put(np.asarray(value, np.int32), _shardings(mesh)[0]))
 
 
 def put_batch(samples: Samples, mesh: Mesh) -> Samples:
