@@ -30,7 +30,6 @@ from kmn_jax.train import (
     jit_make_samples,
     jit_train_step,
     put_batch,
-    put_number,
     put_whole,
     split_cpu,
     training_source,
@@ -105,12 +104,12 @@ def steps(config: TrainConfig, devices: int) -> tuple[Callable[[], Any], Callabl
     make = jit_make_samples(config.step, mesh)
     held = [put_whole(state, mesh)]
     done = {"steps": 0, "batches": 0}
-    memory = train.lower(held[0], source.pack, batches[0], put_number(0, mesh)).compile().memory_analysis()  # type: ignore[attr-defined]
+    memory = train.lower(held[0], source.pack, batches[0], put_whole(np.int32(0), mesh)).compile().memory_analysis()  # type: ignore[attr-defined]
 
     def step() -> Any:
         number = done["steps"]
         done["steps"] += 1
-        held[0], metrics = train(held[0], source.pack, batches[number % _BATCHES], put_number(number, mesh))
+        held[0], metrics = train(held[0], source.pack, batches[number % _BATCHES], put_whole(np.int32(number), mesh))
         assert metrics.taken, "the step was refused: its loss is not finite"
         return metrics
 

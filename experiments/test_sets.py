@@ -28,8 +28,8 @@ from kmn_jax.simulate import PERFECT, RayMesh, SensorConfig, collision_shape
 ASSETS = Path(__file__).parent / "assets"
 DIGESTS = ASSETS / "test_sets.json"
 SPLIT = "test"
-CONFIG = PackConfig(seed=1)  # another seed than the training pack's
-VALIDATION_CONFIG = PackConfig(seed=2, drops=6)
+CONFIG = PackConfig(random_seed=1)  # another seed than the training pack's
+VALIDATION_CONFIG = PackConfig(random_seed=2, drops=6)
 _LIBRARIES = ("cascadio", "jax", "mujoco", "numpy", "open3d", "scipy", "trimesh")
 
 
@@ -130,7 +130,7 @@ def _write_scene(folder: Path, config: PackConfig, sensor: SensorConfig, object_
     mesh = RayMesh(model.vertices, model.triangles)
     shape = collision_shape(model.vertices, model.triangles, config.hulls)
     scenes, _ = bin_scenes(shape, config, int(model.digest[:8], 16))
-    noise = np.random.default_rng((config.seed, object_id)).spawn(len(scenes))
+    noise = np.random.default_rng((config.random_seed, object_id)).spawn(len(scenes))
     frames = [rendered_frame(mesh, scene, object_id, sensor, rng) for scene, rng in zip(scenes, noise, strict=True)]
     farthest = max(float(frame.depth.max()) for frame in frames)
     write_scene(folder, SPLIT, object_id, frames, "m", finest_depth_scale(farthest, "m"))

@@ -1,8 +1,7 @@
 """Train a named config: `python -m experiments.train NAME [--field value ...]`; the names are those of `configs/`.
 
 A run stops between two steps, with everything saved, when it gets SIGTERM or SIGINT (Ctrl-C) or after `--max-minutes`;
-`--resume` goes on to the bit. `--export` writes the state of a run to files of under 16 MiB when it stops, and
-`--import` begins with them on another machine.
+`--resume` goes on to the bit, also in a copy of the run's folder on another machine.
 """
 
 from __future__ import annotations
@@ -28,8 +27,6 @@ class Options:
     folder: Path | None = None  # of the run; runs/NAME unless given
     max_minutes: float | None = None
     resume: bool = False  # go on with the run in the folder, if there is one
-    export: Path | None = None  # folder to write the state to, when the run stops
-    import_: Annotated[Path | None, tyro.conf.arg(name="import")] = None  # folder with an exported state to begin with
     coordinator: str | None = None  # host:port of the first of several processes; they find each other on SLURM and MPI
     processes: int | None = None
     process: int | None = None
@@ -47,35 +44,19 @@ def main(arguments: list[str] | None = None) -> int:
         if not initialize_distributed(options.coordinator, options.processes, options.process):
             pipeline, at_once = options.config.pipeline, options.config.crops_at_once
             split_cpu(pipeline.batch_size // max(pipeline.crops_per_object, at_once or 1))
-        outcome = train(
-            options.config,
-            folder,
-            max_minutes=options.max_minutes,
-            resume=options.resume,
-            import_from=options.import_,
-            export_to=options.export,
-        )
+        outcome = train(options.config, folder, max_minutes=options.max_minutes, resume=options.resume)
     except (InputError, NotFiniteError) as error:
         print(f"train: {error}", file=sys.stderr)
         return 2 if isinstance(error, InputError) else 1
     if outcome.reason:
+        again = shlex.join([name, *(argument for argument in rest if argument != "--resume"), "--resume"])
         print(
             f"stopped after step {outcome.step} of {options.config.num_steps} because {outcome.reason}; go on with:"
-            f" python -m experiments.train {shlex.join([name, *_again(rest)])}"
+            f" python -m experiments.train {again}"
         )
     else:
         print(f"done: {outcome.step} steps; best validation loss {outcome.best_loss} at step {outcome.best_step}")
     return 0
-
-
-def _again(arguments: list[str]) -> list[str]:
-    """Return the arguments that go on with a run: an export is neither taken nor written a second time."""
-    kept, skipped = [], False
-    for argument in arguments:
-        if not skipped and argument.partition("=")[0] not in ("--resume", "--import", "--export"):
-            kept.append(argument)
-        skipped = argument in ("--import", "--export")
-    return [*kept, "--resume"]
 
 
 def _parse(name: str, arguments: list[str]) -> Options:

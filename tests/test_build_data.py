@@ -187,7 +187,7 @@ def test_digests_of_the_test_sets_are_recorded_with_what_made_them() -> None:
 
 def test_builds_a_test_set_seen_by_a_sensor_and_keeps_recipes_apart(tmp_path: Path) -> None:
     sources = [source for source in test_sets.industrial_sources() if source.name == "shaft"]
-    config = PackConfig(drops=1, copies=(2, 2), cameras=CameraConfig(width=243, height=150), seed=1)
+    config = PackConfig(drops=1, copies=(2, 2), cameras=CameraConfig(width=243, height=150), random_seed=1)
     sensor = SensorConfig(noise=0.0015, max_slant=70.0)
     digests = {
         name: test_sets.build_test_set(tmp_path / name, sources, config, chosen, workers=1)

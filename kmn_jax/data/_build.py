@@ -41,9 +41,9 @@ class Record:
     name: str
     split: str
     seconds: float
-    reason: str | None
-    entry: Entry | None
-    facts: dict[str, Any] | None
+    reason: str | None = None
+    entry: Entry | None = None
+    facts: dict[str, Any] | None = None
 
 
 def build_pack(
@@ -138,10 +138,10 @@ def _made(folder: Path, sources: list[Source], config: PackConfig, workers: int,
                     try:
                         yield future.result()
                     except TimeoutError:
-                        yield Record(source.name, source.split, seconds, f"took over {seconds:.0f} s", None, None)
+                        yield Record(source.name, source.split, seconds, f"took over {seconds:.0f} s")
                     except ProcessExpired as error:
                         reason = f"its process ended (exit code {error.exitcode}): the file's reader or physics crashed"
-                        yield Record(source.name, source.split, 0.0, reason, None, None)
+                        yield Record(source.name, source.split, 0.0, reason)
         finally:
             for future in pending:
                 future.cancel()
@@ -153,9 +153,9 @@ def _make(folder: str, source: Source, config: PackConfig) -> Record:
     try:
         item, facts = pack_object(source.path, source.name, source.split, config, source.scenes)
     except InputError as error:
-        return Record(source.name, source.split, time.perf_counter() - start, str(error), None, None)
+        return Record(source.name, source.split, time.perf_counter() - start, str(error))
     entry = write_object(folder, item)
-    return Record(source.name, source.split, time.perf_counter() - start, None, entry, asdict(facts))
+    return Record(source.name, source.split, time.perf_counter() - start, None, entry, facts)
 
 
 class _Journal:

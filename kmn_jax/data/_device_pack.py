@@ -66,11 +66,6 @@ class StackedPack:
     problems: tuple[str, ...]
     digest: str  # SHA-256 of the names and the files' checksums, in the order of the rows
 
-    @property
-    def num_bytes(self) -> int:
-        """The memory that the arrays take."""
-        return sum(array.nbytes for array in self.arrays if array is not None)
-
 
 def stack_pack(pack: Pack, objects: str | Sequence[str], visibility: bool = True) -> StackedPack:
     """Read the objects of a split, or those of the given names, in the manifest's or the given order, and stack them.

@@ -51,9 +51,6 @@ class PackedObject:
     area: float
     points: Float[np.ndarray, "m 3"]
     normals: Float[np.ndarray, "m 3"]
-    symmetry_rotations: Float[np.ndarray, "s 3 3"]
-    symmetry_axes: Float[np.ndarray, "c 3"]
-    symmetry_center: Float[np.ndarray, "3"]
     drops: tuple[Drop, ...]
     digest: str  # SHA-256 of the file that the object comes from
 
@@ -105,10 +102,10 @@ class Pack:
         if name not in self.entries:
             raise InputError(f"{self.folder} has no object {name!r}: its manifest lists {len(self.entries)} others")
         entry = self.entries[name]
-        result = _decode(*self._read(entry.objects), self.folder / entry.objects.path)
+        result = _decode(*read_safetensors(self._checked(entry.objects)), self.folder / entry.objects.path)
         if not visibility or entry.visibility is None:
             return result
-        tensors, _ = self._read(entry.visibility)
+        tensors, _ = read_safetensors(self._checked(entry.visibility))
         try:
             drops = tuple(
                 replace(drop, bits=tensors[f"bits{index}"], bin_bits=tensors[f"bin_bits{index}"])
@@ -142,14 +139,10 @@ class Pack:
             )
         return path
 
-    def _read(self, shard: Shard) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-        return read_safetensors(self._checked(shard))
-
 
 def quantised(item: PackedObject) -> PackedObject:
     """Return the object as it will be read back, without bits: visibility must be found for these surfels and poses."""
-    tensors, metadata = _encode(item)
-    return _decode(tensors, {_METADATA: json.dumps(metadata)}, Path(item.name))
+    return _decode(*_encode(item), Path(item.name))
 
 
 def write_object(folder: str | Path, item: PackedObject) -> Entry:
@@ -162,8 +155,7 @@ def write_object(folder: str | Path, item: PackedObject) -> Entry:
     poses = [array for drop in item.drops for array in (drop.scene.T_bin_object, drop.scene.T_camera_bin)]
     if not all(np.isfinite(array).all() for array in (item.points, item.normals, *poses)):
         raise InputError(f"{item.name}: points, normals or poses hold NaN or infinite values")
-    tensors, metadata = _encode(item)
-    objects = _write_shard(Path(folder), "objects", item.name, tensors, metadata)
+    objects = _write_shard(Path(folder), "objects", item.name, *_encode(item))
     bits: dict[str, np.ndarray] = {}
     for index, drop in enumerate(item.drops):
         if drop.bits is None or drop.bin_bits is None:
@@ -214,15 +206,15 @@ def _check_inside(path: str) -> None:
         raise InputError(f"path {path!r} leaves the pack")
 
 
-def _write_shard(folder: Path, kind: str, name: str, tensors: dict[str, np.ndarray], metadata: dict[str, Any]) -> Shard:
-    content = save(tensors, metadata={_METADATA: json.dumps(metadata)})
+def _write_shard(folder: Path, kind: str, name: str, tensors: dict[str, np.ndarray], metadata: dict[str, str]) -> Shard:
+    content = save(tensors, metadata)
     relative = Path(kind) / f"{name}.safetensors"
     (folder / relative).parent.mkdir(parents=True, exist_ok=True)
     write_whole(folder / relative, content)
     return Shard(relative.as_posix(), len(content), hashlib.sha256(content).hexdigest())
 
 
-def _encode(item: PackedObject) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def _encode(item: PackedObject) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     from scipy.spatial.transform import Rotation
 
     low, high = item.points.min(axis=0).astype(np.float64), item.points.max(axis=0).astype(np.float64)
@@ -246,10 +238,8 @@ def _encode(item: PackedObject) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         ).astype(np.float32),
         "views": np.array(views, np.float32).reshape(-1, 6),
         "bins": np.array(bins, np.float32).reshape(-1, 4),
-        "symmetry_rotations": item.symmetry_rotations.astype(np.float32),
-        "symmetry_axes": item.symmetry_axes.astype(np.float32),
     }
-    metadata = {
+    facts = {
         "name": item.name,
         "split": item.split,
         "diameter": item.diameter,
@@ -257,17 +247,16 @@ def _encode(item: PackedObject) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         "middle": middle.tolist(),
         "half": half,
         "reach": reach,
-        "symmetry_center": np.asarray(item.symmetry_center, np.float64).tolist(),
         "digest": item.digest,
     }
-    return tensors, metadata
+    return tensors, {_METADATA: json.dumps(facts)}
 
 
-def _decode(tensors: dict[str, np.ndarray], header: dict[str, str], path: Path) -> PackedObject:
+def _decode(tensors: dict[str, np.ndarray], metadata: dict[str, str], path: Path) -> PackedObject:
     from scipy.spatial.transform import Rotation
 
     try:
-        facts = json.loads(header[_METADATA])
+        facts = json.loads(metadata[_METADATA])
         middle = np.array(facts["middle"])
         rotations = Rotation.from_quat(tensors["rotations"] / _LEVELS, scalar_first=True).as_matrix()
         centers = tensors["positions"] * (facts["reach"] / _LEVELS)
@@ -290,9 +279,6 @@ def _decode(tensors: dict[str, np.ndarray], header: dict[str, str], path: Path) 
             area=facts["area"],
             points=(tensors["surfel_positions"] * (facts["half"] / _LEVELS) + middle).astype(np.float32),
             normals=_from_octahedral(tensors["surfel_normals"]),
-            symmetry_rotations=tensors["symmetry_rotations"].astype(np.float64),
-            symmetry_axes=tensors["symmetry_axes"].astype(np.float64),
-            symmetry_center=np.array(facts["symmetry_center"]),
             drops=tuple(drops),
             digest=facts["digest"],
         )

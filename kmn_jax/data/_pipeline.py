@@ -35,22 +35,18 @@ class PipelineConfig:
     batch_size: int = 14  # of all hosts together
     samples_per_object: int = 160  # 20 drops x 8, as published
     crops_per_object: int = 1
-    seed: int = 0
-    epochs: int | None = None  # None: endless. Otherwise what is left after the last full batch is dropped
+    random_seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("batch_size", "samples_per_object", "crops_per_object", "epochs"):
+        each = self.crops_per_object
+        for name in ("crops_per_object", "batch_size", "samples_per_object"):
             value = getattr(self, name)
-            if value is not None and value < 1:
+            if value < 1:
                 raise InputError(f"pipeline config: {name} = {value} must be 1 or more")
-        for name in ("batch_size", "samples_per_object"):
-            if getattr(self, name) % self.crops_per_object:
-                raise InputError(
-                    f"pipeline config: {name} = {getattr(self, name)} must be a multiple of"
-                    f" crops_per_object = {self.crops_per_object}"
-                )
-        if not 0 <= self.seed < 2**63:
-            raise InputError(f"pipeline config: seed = {self.seed} must be from 0 to 2**63 - 1")
+            if value % each:
+                raise InputError(f"pipeline config: {name} = {value} must be a multiple of crops_per_object = {each}")
+        if not 0 <= self.random_seed < 2**63:
+            raise InputError(f"pipeline config: random_seed = {self.random_seed} must be from 0 to 2**63 - 1")
 
     @property
     def groups_per_object(self) -> int:
@@ -93,8 +89,8 @@ class SampleBatches:
     ) -> None:
         """Take the rows `shard_index` of `shard_count` equal shares of each batch.
 
-        `num_drops` is that of each object or of all. Raises InputError for counts below 1, batches that the hosts or
-        epochs cannot share, and epochs together with `ordered`.
+        `num_drops` is that of each object or of all. Raises InputError for counts below 1, and batches that the hosts
+        cannot share.
         """
         drops = np.full(num_objects, num_drops) if isinstance(num_drops, int) else np.asarray(num_drops)
         if num_objects < 1 or len(drops) != num_objects or drops.min() < 1:
@@ -109,24 +105,12 @@ class SampleBatches:
                 f"batch_size = {config.batch_size} must be a multiple of crops_per_object = {config.crops_per_object}"
                 f" times the {shard_count} hosts"
             )
-        if ordered and config.epochs is not None:
-            raise InputError(f"epochs = {config.epochs}, but an ordered pass is one epoch: leave it None")
         self.config, self.ordered = config, ordered
         self.num_objects, self.num_drops = num_objects, drops.astype(np.int64)
         self.shard_index, self.shard_count = shard_index, shard_count
         groups = num_objects * config.groups_per_object
         self._last_group = groups - 1 if ordered else sys.maxsize
-        if ordered:
-            self._length = -(-groups // config.groups_per_batch)
-        elif config.epochs is None:
-            self._length = sys.maxsize
-        else:
-            self._length = groups * config.epochs // config.groups_per_batch
-        if not self._length:
-            raise InputError(
-                f"epochs = {config.epochs} of {groups * config.crops_per_object} samples do not fill a batch of"
-                f" {config.batch_size}: choose a smaller batch_size"
-            )
+        self._length = -(-groups // config.groups_per_batch) if ordered else sys.maxsize
         self._round: tuple[int, Int64[np.ndarray, " o"]] | None = None
 
     def __len__(self) -> int:
@@ -145,9 +129,8 @@ class SampleBatches:
     @property
     def facts(self) -> dict[str, Any]:
         """What the order of the samples depends on."""
-        values = {name: value for name, value in asdict(self.config).items() if name != "epochs"}
         drops = hashlib.sha256(self.num_drops.astype("<i8").tobytes()).hexdigest()
-        return {**values, "ordered": self.ordered, "num_objects": self.num_objects, "num_drops": drops}
+        return {**asdict(self.config), "ordered": self.ordered, "num_objects": self.num_objects, "num_drops": drops}
 
     def _group(self, position: int) -> SampleIndex:
         config, size = self.config, self.config.crops_per_object
@@ -190,17 +173,8 @@ class SampleBatches:
     def _random(self, stream: int, first: int, second: int, count: int) -> UInt64[np.ndarray, " count"]:
         # Bits straight from the counter: unlike the draws of a Generator they are the same in all NumPy versions.
         counter = np.array([0, first, second, 0], dtype=np.uint64)
-        key = np.array([self.config.seed, stream], dtype=np.uint64)
+        key = np.array([self.config.random_seed, stream], dtype=np.uint64)
         return np.random.Philox(counter=counter, key=key).random_raw(count)
-
-
-def index_dataset(batches: SampleBatches, make: Callable[[SampleIndex], Any] | None = None) -> Any:
-    """Return batches as a `grain.MapDataset`, if asked for with what `make` makes of each."""
-    import grain
-
-    # Whole batches are its elements: grain takes 0.1 ms for each, and its own shuffle milliseconds on short sources.
-    dataset = grain.MapDataset.source(batches)
-    return dataset if make is None else dataset.map(make)
 
 
 class BatchIterator(Generic[_T]):
@@ -226,7 +200,9 @@ class BatchIterator(Generic[_T]):
 
         self._facts = {"identity": identity, **batches.facts}
         options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=ahead if threads else 0)
-        self._iterator = iter(index_dataset(batches, make).to_iter_dataset(options))
+        # Whole batches are its elements: grain takes 0.1 ms for each, its own shuffle milliseconds on short sources.
+        dataset = grain.MapDataset.source(batches)
+        self._iterator = iter((dataset if make is None else dataset.map(make)).to_iter_dataset(options))
         self._length, self.next_batch = len(batches), 0
 
     def __iter__(self) -> Iterator[_T]:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int, UInt8
@@ -14,7 +13,7 @@ from jaxtyping import Int, UInt8
 from kmn_jax.bop import BopFrame, scene_frame
 from kmn_jax.data._pack import Drop, PackedObject, quantised
 from kmn_jax.errors import InputError
-from kmn_jax.objects import ObjectConfig, ObjectModel, load_object
+from kmn_jax.objects import ObjectConfig, load_object
 from kmn_jax.simulate import (
     PERFECT,
     BinConfig,
@@ -48,7 +47,7 @@ class PackConfig:
     hulls: HullConfig = field(default_factory=HullConfig)
     bins: BinConfig = field(default_factory=BinConfig)
     cameras: CameraConfig = field(default_factory=CameraConfig)
-    seed: int = 0
+    random_seed: int = 0
 
     def __post_init__(self) -> None:
         if self.surfels < 8 or self.surfels % 8 or self.bin_surfels < 8 or self.bin_surfels % 8:
@@ -62,66 +61,62 @@ class PackConfig:
         return np.rint(np.linspace(*self.copies, self.drops)).astype(int)
 
 
-@dataclass(frozen=True)
-class BuildFacts:
-    """What making an object took and gave: seconds by stage, and for each drop what physics reports."""
-
-    seconds: dict[str, float]
-    hidden_share: float
-    hulls: int
-    penetrations: list[float]  # deepest contact of each drop, in diagonals
-    capped: list[bool]
-    attempts: list[int]
-    floor_shares: list[float]
-
-
 def pack_object(
     path: str | Path, name: str, split: str, config: PackConfig, scenes: int = 0
-) -> tuple[PackedObject, BuildFacts]:
+) -> tuple[PackedObject, dict[str, Any]]:
     """Make a pack's object of a CAD file: the surfels, and `config.drops` accepted scenes with their views.
 
+    Beside it come facts for JSON: seconds by stage, and for each drop what physics reports, penetrations in diagonals.
     The same file, name, config and number of `scenes` give the same bits on one machine. Raises InputError if the file
     is broken or a drop is not accepted.
     """
-    clock = _Clock()
-    with clock("model"):
-        model = load_object(path, config=ObjectConfig(num_points=config.surfels, random_seed=config.seed)).in_unit("m")
-    with clock("hulls"):
-        shape = collision_shape(model.vertices, model.triangles, config.hulls)
-    mesh = RayMesh(model.vertices, model.triangles)
-    with clock("physics"):
-        drops, results = bin_scenes(shape, config, int(model.digest[:8], 16) + scenes)
-    item = replace(_without_drops(model, name, split), drops=tuple(Drop(scene) for scene in drops))
-    with clock("visibility"):
-        if config.visibility:
-            exact = quantised(item)
-            bits = [visibility_bits(mesh, exact, drop.scene, config.bin_surfels) for drop in exact.drops]
-            seen = (Drop(scene, *pair) for scene, pair in zip(drops, bits, strict=True))
-            item = replace(item, drops=tuple(seen))
-    facts = BuildFacts(
-        seconds=clock.seconds,
-        hidden_share=model.hidden_share,
-        hulls=len(shape.parts),
-        penetrations=[result.penetration for result in results],
-        capped=[result.capped for result in results],
-        attempts=[result.attempts for result in results],
-        floor_shares=[result.floor_share for result in results],
+    times = [time.perf_counter()]
+    model = load_object(path, config=ObjectConfig(num_points=config.surfels, random_seed=config.random_seed)).in_unit(
+        "m"
     )
-    return item, facts
+    times.append(time.perf_counter())
+    shape = collision_shape(model.vertices, model.triangles, config.hulls)
+    times.append(time.perf_counter())
+    drops, results = bin_scenes(shape, config, int(model.digest[:8], 16) + scenes)
+    times.append(time.perf_counter())
+    item = PackedObject(
+        name=name,
+        split=split,
+        diameter=model.diameter,
+        area=model.area,
+        points=model.points,
+        normals=model.normals,
+        drops=tuple(Drop(scene) for scene in drops),
+        digest=model.digest,
+    )
+    if config.visibility:
+        mesh, exact = RayMesh(model.vertices, model.triangles), quantised(item)
+        bits = [visibility_bits(mesh, exact, drop.scene, config.bin_surfels) for drop in exact.drops]
+        item = replace(item, drops=tuple(Drop(scene, *pair) for scene, pair in zip(drops, bits, strict=True)))
+    times.append(time.perf_counter())
+    return item, {
+        "seconds": dict(zip(("model", "hulls", "physics", "visibility"), np.diff(times).tolist(), strict=True)),
+        "hidden_share": model.hidden_share,
+        "hulls": len(shape.parts),
+        "penetrations": [result.penetration for result in results],
+        "capped": [result.capped for result in results],
+        "attempts": [result.attempts for result in results],
+        "floor_shares": [result.floor_share for result in results],
+    }
 
 
 def bin_scenes(shape: CollisionShape, config: PackConfig, object_seed: int) -> tuple[list[BinScene], list[DropResult]]:
     """Drop copies into bins as the recipe says and put a camera above each. Raises InputError where one fails."""
     scenes, results = [], []
     for index, copies in enumerate(config.copies_per_drop.tolist()):
-        seed = (config.seed, object_seed, index)
-        result = settle(shape, copies, config.bins, seed)
+        random_seed = (config.random_seed, object_seed, index)
+        result = settle(shape, copies, config.bins, random_seed)
         if not result.accepted:
             raise InputError(
                 f"{copies} copies found no acceptable rest in {result.attempts} attempts: {result.rejected[-1]}"
             )
         camera, T_camera_bin = place_camera(
-            result.bin, shape.diagonal, config.cameras, np.random.default_rng((*seed, 1))
+            result.bin, shape.diagonal, config.cameras, np.random.default_rng((*random_seed, 1))
         )
         scenes.append(BinScene(result.bin, result.T_bin_object, camera, T_camera_bin))
         results.append(result)
@@ -154,30 +149,3 @@ def rendered_frame(
     seen = render(mesh, scene)
     depth = seen.depth if sensor == PERFECT else sense(mesh, scene, seen, sensor, rng)
     return scene_frame(scene, object_id, depth, seen.instances, seen.total_pixels, seen.total_boxes)
-
-
-def _without_drops(model: ObjectModel, name: str, split: str) -> PackedObject:
-    return PackedObject(
-        name=name,
-        split=split,
-        diameter=model.diameter,
-        area=model.area,
-        points=model.points,
-        normals=model.normals,
-        symmetry_rotations=model.symmetries.rotations,
-        symmetry_axes=model.symmetries.axes,
-        symmetry_center=model.symmetries.center,
-        drops=(),
-        digest=model.digest,
-    )
-
-
-class _Clock:
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.seconds[stage] = time.perf_counter() - start

@@ -1,9 +1,9 @@
 """The network: published shapes from exact algebra, object and scene features as reusable values."""
 
+from kmn_jax.models._config import KeyMatchNetConfig
 from kmn_jax.models._invariants import NUM_OBJECT_INVARIANTS, NUM_PAIR_INVARIANTS, NUM_SCENE_INVARIANTS
 from kmn_jax.models._keymatchnet import (
     KeyMatchNet,
-    KeyMatchNetConfig,
     Model,
     ObjectFeatures,
     create_model,

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
 from kmn_jax.geometry import k_nearest, neighbor_graph, space_filling_order
+from kmn_jax.models._config import KeyMatchNetConfig
 from kmn_jax.models._edgeconv import EdgeConv
-from kmn_jax.models._invariants import EncoderInputs
+from kmn_jax.models._invariants import NUM_PAIR_INVARIANTS, EncoderInputs
 from kmn_jax.models._layers import Compute, NormalizedLinear, channel_moments, product
-
-Graph = Literal["dynamic", "static"]
 
 
 class Encoder(nnx.Module):
@@ -24,26 +21,17 @@ class Encoder(nnx.Module):
     block every keypoint is a neighbour of every other.
     """
 
-    def __init__(
-        self,
-        point_features: int,
-        pair_features: int,
-        edge_width: int,
-        embedding_width: int,
-        out_width: int,
-        num_neighbors: int,
-        groups: int,
-        graph: Graph,
-        *,
-        rngs: nnx.Rngs,
-    ) -> None:
-        self.edge1 = EdgeConv(point_features, edge_width, 2, groups, pair_features=pair_features, rngs=rngs)
-        self.edge2 = EdgeConv(edge_width, edge_width, 2, groups, rngs=rngs)
-        self.edge3 = EdgeConv(edge_width, edge_width, 1, groups, rngs=rngs)
-        self.embedding = NormalizedLinear(3 * edge_width, embedding_width, groups, rngs=rngs)
-        self.out = NormalizedLinear(embedding_width + 3 * edge_width, out_width, groups, rngs=rngs)
-        self.num_neighbors = num_neighbors
-        self.graph = graph
+    def __init__(self, config: KeyMatchNetConfig, invariants: int, *, rngs: nnx.Rngs) -> None:
+        """Take clouds of 6 channels, or of so many `invariants` and those of pairs, as the config says."""
+        width, groups = config.edge_width, config.groups
+        points, pairs = (invariants, NUM_PAIR_INVARIANTS) if config.inputs == "invariant" else (6, 0)
+        self.edge1 = EdgeConv(points, width, 2, groups, pair_features=pairs, rngs=rngs)
+        self.edge2 = EdgeConv(width, width, 2, groups, rngs=rngs)
+        self.edge3 = EdgeConv(width, width, 1, groups, rngs=rngs)
+        self.embedding = NormalizedLinear(3 * width, config.embedding_width, groups, rngs=rngs)
+        self.out = NormalizedLinear(config.embedding_width + 3 * width, config.scene_width, groups, rngs=rngs)
+        self.num_neighbors = config.num_neighbors
+        self.graph = config.graph
 
     def __call__(
         self,

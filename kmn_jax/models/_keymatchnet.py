@@ -1,4 +1,4 @@
-"""KeyMatchNet (arXiv 2303.16102): the network, its config and its three pure entry points.
+"""KeyMatchNet (arXiv 2303.16102): the network and its three pure entry points.
 
 `encode_object` once per object, `encode_scene` once per crop, `match` for every pair of them. Frames: a crop
 enters with its seed point at the origin, in the scene's axes; an object cloud in the object's frame.
@@ -6,9 +6,8 @@ enters with its seed point at the origin, in the scene's axes; an object cloud i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -17,99 +16,21 @@ from jaxtyping import Array, Bool, Float, Int
 
 from kmn_jax.errors import InputError, float_array, index_array, is_traced, mask_array, positive_scalar, row_count
 from kmn_jax.geometry import largest_distance
-from kmn_jax.models._cloud_inputs import check_extent, cloud_array
-from kmn_jax.models._encoder import Encoder, Graph
+from kmn_jax.models._config import KeyMatchNetConfig
+from kmn_jax.models._encoder import Encoder
 from kmn_jax.models._invariants import (
     NUM_OBJECT_INVARIANTS,
-    NUM_PAIR_INVARIANTS,
     NUM_SCENE_INVARIANTS,
-    EncoderInputs,
     object_invariants,
     raw_inputs,
     scene_invariants,
 )
-from kmn_jax.models._layers import Compute, NormalizedLinear, dropout
+from kmn_jax.models._layers import NormalizedLinear, dropout
 from kmn_jax.models._normalization import metric_object, metric_scene, released_object, released_scene
-from kmn_jax.models._pair_head import PairDropout, PairHead
+from kmn_jax.models._pair_head import PairHead
 from kmn_jax.typing import ArrayInput
 
-Normalization = Literal["metric", "released"]
-Inputs = Literal["raw", "invariant"]
-ObjectBranch = Literal["cad", "learned"]
-
-_CHOICES = {
-    "normalization": get_args(Normalization),
-    "inputs": get_args(Inputs),
-    "object_branch": get_args(ObjectBranch),
-    "graph": get_args(Graph),
-    "compute": get_args(Compute),
-    "pair_dropout": get_args(PairDropout),
-}
-
-
-@dataclass(frozen=True)
-class KeyMatchNetConfig:
-    """Sizes and switches of the network; the defaults are the published ones, but for the input scaling.
-
-    Attributes:
-        num_scene_points, num_object_points, num_keypoints: N, M and K, the sizes that data is made for. The
-            network itself takes any.
-        normalization: "metric" divides both clouds by one length, "released" is what the authors' weights need.
-        inputs: "raw" coordinates and normals as published, or rotation "invariant" point pair features.
-        graph: "dynamic" finds neighbours anew in feature space, "static" keeps those of the coordinates.
-        object_branch: where keypoint features come from: the "cad" cloud, or "learned", for one object that the
-            network is trained for, and its K fixed keypoints.
-        object_digest: SHA-256 of that object's CAD file; empty for networks of any object.
-        compute: arithmetic of the layers; statistics, distances and logits are float32 in all.
-        pair_dropout: one dropout mask for all keypoints of a point ("shared"), or "per_pair" as published.
-    """
-
-    num_scene_points: int = 2048
-    num_object_points: int = 2048
-    num_keypoints: int = 20
-    num_neighbors: int = 20
-    edge_width: int = 64
-    embedding_width: int = 1024
-    scene_width: int = 512
-    object_width: int = 128
-    pair_width: int = 256
-    groups: int = 32
-    dropout: float = 0.4
-    pair_dropout: PairDropout = "shared"
-    normalization: Normalization = "metric"
-    inputs: Inputs = "raw"
-    graph: Graph = "dynamic"
-    object_branch: ObjectBranch = "cad"
-    object_digest: str = ""
-    compute: Compute = "float32"
-
-    def __post_init__(self) -> None:
-        for name, choices in _CHOICES.items():
-            if getattr(self, name) not in choices:
-                raise ValueError(f"{name} is {getattr(self, name)!r}, but must be one of {', '.join(choices)}")
-        sizes = ("num_scene_points", "num_object_points", "num_keypoints", "num_neighbors", "groups")
-        widths = ("edge_width", "embedding_width", "scene_width", "object_width", "pair_width")
-        for name in (*sizes, *widths):
-            if not isinstance(getattr(self, name), int):
-                raise ValueError(f"{name} is {getattr(self, name)!r}, but must be a whole number")
-        for name in sizes:
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, but must be at least 1")
-        for name in widths:
-            if getattr(self, name) < 1 or getattr(self, name) % self.groups:
-                raise ValueError(f"{name} is {getattr(self, name)}, but must be a multiple of groups = {self.groups}")
-        if not 0 <= self.dropout < 1:
-            raise ValueError(f"dropout is {self.dropout}, but must be in [0, 1)")
-        if self.inputs == "invariant" and self.normalization == "released":
-            raise ValueError(
-                'inputs "invariant" need normalization "metric": "released" scales the axes of space unevenly'
-            )
-        if self.object_digest and self.object_branch == "cad":
-            raise ValueError("object_digest names the object of a network with learned features, which this is not")
-        if self.num_keypoints > self.num_object_points:
-            raise ValueError(
-                f"{self.num_keypoints} keypoints cannot be drawn from {self.num_object_points} object points"
-            )
+_LARGEST = 1e18  # a length whose square, summed over three axes, still fits float32
 
 
 class Model(NamedTuple):
@@ -146,24 +67,9 @@ class KeyMatchNet(nnx.Module):
 
     def __init__(self, config: KeyMatchNetConfig, *, rngs: nnx.Rngs) -> None:
         self.config = config
-        invariant = config.inputs == "invariant"
-
-        def encoder(invariants: int) -> Encoder:
-            return Encoder(
-                invariants if invariant else 6,
-                NUM_PAIR_INVARIANTS if invariant else 0,
-                config.edge_width,
-                config.embedding_width,
-                config.scene_width,
-                config.num_neighbors,
-                config.groups,
-                config.graph,
-                rngs=rngs,
-            )
-
-        self.scene = encoder(NUM_SCENE_INVARIANTS)
+        self.scene = Encoder(config, NUM_SCENE_INVARIANTS, rngs=rngs)
         if config.object_branch == "cad":
-            self.object = encoder(NUM_OBJECT_INVARIANTS)
+            self.object = Encoder(config, NUM_OBJECT_INVARIANTS, rngs=rngs)
             self.object_out = NormalizedLinear(config.scene_width, config.object_width, config.groups, rngs=rngs)
         else:
             shape = config.num_keypoints, config.object_width
@@ -189,7 +95,6 @@ class KeyMatchNet(nnx.Module):
                     f" {config.num_keypoints}"
                 )
             return self.keypoints[...]
-        inputs: EncoderInputs
         if config.normalization == "released":
             inputs = raw_inputs(released_object(cloud))
         elif config.inputs == "raw":
@@ -272,12 +177,12 @@ def encode_object(
     Raises:
         InputError: wrong shapes, dtypes, values that are not finite, indices out of range, no extent.
     """
-    cloud = cloud_array(object_cloud, "object_cloud")
+    cloud = _cloud_array(object_cloud, "object_cloud")
     indices = index_array(keypoint_indices, "keypoint_indices", None, cloud.shape[0])
     if indices.shape[0] < 1:
         raise InputError("keypoint_indices is empty: choose at least one keypoint")
     graphdef, parameters = _pair(model)
-    check_extent(jnp.ptp(cloud[:, :3], axis=0).max(), "object_cloud")
+    _check_extent(jnp.ptp(cloud[:, :3], axis=0).max(), "object_cloud")
     length = _diameter(cloud[:, :3]) if length is None else positive_scalar(length, "length")
     return _encode_object(graphdef, parameters, cloud, indices, length.astype(jnp.float32))
 
@@ -305,12 +210,12 @@ def encode_scene(
         InputError: wrong shapes, dtypes, values that are not finite, fewer than one real point, no extent.
     """
     given = None if mask is None else mask_array(mask, "mask", row_count(scene_crop, "scene_crop"))
-    crop = cloud_array(scene_crop, "scene_crop", given)
+    crop = _cloud_array(scene_crop, "scene_crop", given)
     if given is not None and not is_traced(given) and not bool(given.any()):
         raise InputError("mask is all false: scene_crop has no real point")
     graphdef, parameters = _pair(model)
     radius = _crop_radius(crop, given)
-    check_extent(radius, "scene_crop")
+    _check_extent(radius, "scene_crop")
     length = radius if length is None else positive_scalar(length, "length")
     return _encode_scene(graphdef, parameters, crop, length.astype(jnp.float32), given)
 
@@ -340,6 +245,24 @@ def match(
     scene = float_array(scene_features, "scene_features", (None, None))
     keypoints = float_array(object_features.features, "object_features.features", (None, None))
     return _match(graphdef, parameters, scene, keypoints)
+
+
+def _cloud_array(value: ArrayInput, name: str, mask: jax.Array | None = None) -> Float[Array, "n 6"]:
+    """Return a cloud (n, 6) as float32. Raises InputError for another shape or dtype, or without any point."""
+    cloud = float_array(value, name, (None, 6), mask=mask)
+    if cloud.shape[0] == 0:
+        raise InputError(f"{name} is empty: at least one point is needed")
+    return cloud.astype(jnp.float32)
+
+
+def _check_extent(extent: Float[Array, ""], name: str) -> None:
+    """Raise InputError where a cloud has no extent, or one beyond float32; under a trace nothing is known."""
+    if is_traced(extent):
+        return
+    if float(extent) == 0:
+        raise InputError(f"{name} has no extent: all of its points coincide")
+    if not float(extent) < _LARGEST:
+        raise InputError(f"{name} is too large for float32: use a larger unit of length")
 
 
 @partial(jax.jit, static_argnums=0)

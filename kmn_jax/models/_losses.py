@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from kmn_jax.errors import InputError
 from kmn_jax.geometry import nearest
 
 
@@ -22,7 +23,7 @@ class LossConfig:
     def __post_init__(self) -> None:
         weights = (self.segmentation_weight, self.keypoint_weight)
         if min(weights) < 0 or max(weights) <= 0:
-            raise ValueError(f"loss weights are {weights}, but none may be negative and one must be above zero")
+            raise InputError(f"loss weights are {weights}, but none may be negative and one must be above zero")
 
 
 class MatchingLoss(NamedTuple):

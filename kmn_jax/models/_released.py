@@ -11,7 +11,8 @@ from safetensors.numpy import save
 
 from kmn_jax.errors import InputError
 from kmn_jax.files import read_safetensors, write_whole
-from kmn_jax.models._keymatchnet import KeyMatchNetConfig, Model, model_structure
+from kmn_jax.models._config import KeyMatchNetConfig
+from kmn_jax.models._keymatchnet import Model, model_structure
 from kmn_jax.models._torch_file import read_state_dict, state_dict_bytes
 
 RELEASED_CONFIG = KeyMatchNetConfig(normalization="released", pair_dropout="per_pair")

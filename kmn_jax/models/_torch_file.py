@@ -75,40 +75,26 @@ def state_dict_bytes(tensors: dict[str, np.ndarray]) -> bytes:
     return buffer.getvalue()
 
 
-class _Storage:
-    """Stands for one torch.XStorage class of the pickle: only its name matters."""
-
-    def __init__(self, name: str) -> None:
-        self.dtype = np.dtype(_STORAGE_DTYPES[name])
-        self.is_bfloat16 = name == "BFloat16Storage"
-
-
 class _Unpickler(pickle.Unpickler):
     def __init__(self, archive: zipfile.ZipFile, prefix: str, path: Path) -> None:
         super().__init__(io.BytesIO(archive.read(prefix + "data.pkl")))
         self._archive, self._prefix, self._path = archive, prefix, path
 
     def find_class(self, module: str, name: str) -> Any:
-        if (module, name) == ("collections", "OrderedDict"):
-            return OrderedDict
-        if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
-            return _tensor
-        if (module, name) == ("torch._utils", "_rebuild_parameter"):
-            return _parameter
         if module == "torch" and name in _STORAGE_DTYPES:
-            return _Storage(name)
-        if (module, name) == ("torch", "Size"):
-            return tuple
-        raise InputError(f"{self._path} is refused: its pickle names {module}.{name}, which no state dict needs")
+            return name  # of a class, which only says what the buffer holds
+        if (module, name) not in _MEANINGS:
+            raise InputError(f"{self._path} is refused: its pickle names {module}.{name}, which no state dict needs")
+        return _MEANINGS[module, name]
 
     def persistent_load(self, identifier: Any) -> np.ndarray:
         kind, storage, key, _location, count = identifier
-        if kind != "storage" or not isinstance(storage, _Storage):
+        if kind != "storage" or storage not in _STORAGE_DTYPES:
             raise InputError(f"{self._path} is refused: its pickle refers to {kind!r}, which no state dict needs")
-        values = np.frombuffer(self._archive.read(f"{self._prefix}data/{key}"), dtype=storage.dtype)
+        values = np.frombuffer(self._archive.read(f"{self._prefix}data/{key}"), dtype=_STORAGE_DTYPES[storage])
         if len(values) < count:
             raise InputError(f"{self._path} is truncated: buffer {key} holds {len(values)} of {count} values")
-        return (values.astype(np.uint32) << 16).view(np.float32) if storage.is_bfloat16 else values
+        return (values.astype(np.uint32) << 16).view(np.float32) if storage == "BFloat16Storage" else values
 
 
 def _tensor(storage: np.ndarray, offset: int, size: tuple, stride: tuple, *_: Any) -> np.ndarray:
@@ -122,6 +108,14 @@ def _tensor(storage: np.ndarray, offset: int, size: tuple, stride: tuple, *_: An
 
 def _parameter(tensor: np.ndarray, *_: Any) -> np.ndarray:
     return tensor
+
+
+_MEANINGS = {
+    ("collections", "OrderedDict"): OrderedDict,
+    ("torch", "Size"): tuple,
+    ("torch._utils", "_rebuild_tensor_v2"): _tensor,
+    ("torch._utils", "_rebuild_parameter"): _parameter,
+}
 
 
 def _pickle_of(tensors: dict[str, np.ndarray]) -> bytes:

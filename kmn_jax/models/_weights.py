@@ -14,7 +14,8 @@ from safetensors.numpy import save
 
 from kmn_jax.errors import InputError
 from kmn_jax.files import read_safetensors, write_whole
-from kmn_jax.models._keymatchnet import KeyMatchNetConfig, Model, model_structure
+from kmn_jax.models._config import KeyMatchNetConfig
+from kmn_jax.models._keymatchnet import Model, model_structure
 
 _CONFIG_KEY = "kmn_jax.config"
 

@@ -20,7 +20,7 @@ from kmn_jax.geometry import (
     transform_points,
 )
 from kmn_jax.pose._kabsch import fit_rigid, rotation_is_determined
-from kmn_jax.pose._result import PoseResult, PoseStatus
+from kmn_jax.pose._result import PoseResult, PoseStatus, first_status
 from kmn_jax.typing import ArrayInput, Mask, Normals, Points, Pose, Scalar
 
 _MIN_PAIRS = 6  # equations that fix a pose when each pair gives one
@@ -41,15 +41,14 @@ class IcpConfig:
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
         if self.method not in ("point_to_plane", "point_to_point"):
-            raise ValueError(f"method is {self.method!r}, but must be 'point_to_plane' or 'point_to_point'")
+            raise InputError(f"method is {self.method!r}, but must be 'point_to_plane' or 'point_to_point'")
         if self.robust not in ("none", "cauchy", "tukey"):
-            raise ValueError(f"robust is {self.robust!r}, but must be 'none', 'cauchy' or 'tukey'")
+            raise InputError(f"robust is {self.robust!r}, but must be 'none', 'cauchy' or 'tukey'")
         if self.iterations < 1:
-            raise ValueError(f"iterations is {self.iterations}, but must be at least 1")
-        if not self.distance_gate > 0:
-            raise ValueError(f"distance_gate is {self.distance_gate}, but must be above zero")
-        if not self.tolerance > 0:
-            raise ValueError(f"tolerance is {self.tolerance}, but must be above zero")
+            raise InputError(f"iterations is {self.iterations}, but must be at least 1")
+        for name in ("distance_gate", "tolerance"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name} is {getattr(self, name)}, but must be above zero")
 
 
 class _Pairs(NamedTuple):
@@ -186,14 +185,13 @@ def _icp(
         is_moving, iterate, _State(jnp.int32(0), start, first, jnp.array(jnp.inf), jnp.array(True))
     )
 
-    conditions = [
+    status = first_status(
         (~valid, PoseStatus.INVALID_INPUT),
         (first.inside.sum(dtype=jnp.int32) < _MIN_PAIRS, PoseStatus.NO_OVERLAP),
         (~state.determined, PoseStatus.DEGENERATE),
         (state.pairs.cost > first.cost + _DIVERGED * gate**2, PoseStatus.DIVERGED),
         (state.change > config.tolerance, PoseStatus.ITERATION_LIMIT),
-    ]
-    status = jnp.select([test for test, _ in conditions], [jnp.int32(code) for _, code in conditions], PoseStatus.OK)
+    )
     moved_on = (status == PoseStatus.OK) | (status == PoseStatus.ITERATION_LIMIT)
     moved_on = moved_on & (state.pairs.cost <= first.cost)
     pairs = jax.tree.map(lambda new, old: jnp.where(moved_on, new, old), state.pairs, first)

@@ -43,7 +43,8 @@ def kabsch(source: ArrayInput, target: ArrayInput, weights: ArrayInput | None = 
         raise InputError(f"source has {count} points, but a pose needs at least 3")
     if mask is not None and int(mask.sum()) < 3:
         raise InputError(f"weights are positive for {int(mask.sum())} points only, but a pose needs at least 3")
-    return _fit_rigid(*at_least_float32(source, target, weights))
+    dtype = jnp.float64 if jnp.float64 in (source.dtype, target.dtype, weights.dtype) else jnp.float32
+    return _fit_rigid(source.astype(dtype), target.astype(dtype), weights.astype(dtype))
 
 
 def fit_rigid(source: Points, target: Points, weights: Float[Array, " n"]) -> Pose:
@@ -65,12 +66,6 @@ def fit_rigid(source: Points, target: Points, weights: Float[Array, " n"]) -> Po
 
 
 _fit_rigid = jax.jit(fit_rigid)
-
-
-def at_least_float32(*arrays: jax.Array) -> tuple[jax.Array, ...]:
-    """Return floating arrays in one dtype: float64 if one of them has it, else float32."""
-    dtype = jnp.float64 if any(array.dtype == jnp.float64 for array in arrays) else jnp.float32
-    return tuple(array.astype(dtype) for array in arrays)
 
 
 @jax.custom_jvp

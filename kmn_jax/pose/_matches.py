@@ -44,11 +44,11 @@ class MatchConfig:
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
         if not 0 < self.vote_threshold <= 1:
-            raise ValueError(f"vote_threshold is {self.vote_threshold}, but must be in (0, 1]")
+            raise InputError(f"vote_threshold is {self.vote_threshold}, but must be in (0, 1]")
         if self.softmax not in ("keypoints", "points"):
-            raise ValueError(f"softmax is {self.softmax!r}, but must be 'keypoints' or 'points'")
+            raise InputError(f"softmax is {self.softmax!r}, but must be 'keypoints' or 'points'")
         if self.capacity < 3:
-            raise ValueError(f"capacity is {self.capacity}, but a pose needs at least 3 matches")
+            raise InputError(f"capacity is {self.capacity}, but a pose needs at least 3 matches")
 
 
 def find_matches(

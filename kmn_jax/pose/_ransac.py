@@ -15,10 +15,14 @@ from kmn_jax.errors import InputError, float_array, is_traced, mask_array, posit
 from kmn_jax.geometry import from_rotation_translation
 from kmn_jax.pose._kabsch import fit_rigid, rotation_is_determined
 from kmn_jax.pose._matches import Matches
-from kmn_jax.pose._result import PoseResult, PoseStatus
+from kmn_jax.pose._result import PoseResult, PoseStatus, first_status
 from kmn_jax.typing import ArrayInput, Mask, Normals, Points, Pose, PRNGKey, Scalar
 
 _MIN_HEIGHT = 0.01  # of the diameter: a flatter triangle says nothing about the rotation about its long side
+
+# Poses that differ by more, in rotation or by so many diameters, are another mode.
+_MODE_DEGREES = 30.0
+_MODE_DISTANCE = 0.15
 
 
 @dataclass(frozen=True)
@@ -40,31 +44,24 @@ class RansacConfig:
     num_refinements: int = 5
     min_inliers: int = 5
     min_inlier_share: float = 0.03
-    mode_degrees: float = 30.0  # poses that differ by more than this, or by `mode_distance`, are another mode
-    mode_distance: float = 0.15
 
     def __post_init__(self) -> None:
         """Refuse values that contradict each other or their meaning."""
         if not 1 <= self.num_hypotheses <= self.num_candidates:
-            raise ValueError(
+            raise InputError(
                 f"num_hypotheses is {self.num_hypotheses}, but must be between 1 and"
                 f" num_candidates = {self.num_candidates}, from which they are selected"
             )
         if not self.distance_gate > 0:
-            raise ValueError(f"distance_gate is {self.distance_gate}, but must be above zero")
+            raise InputError(f"distance_gate is {self.distance_gate}, but must be above zero")
         if not 0 < self.normal_gate_degrees <= 180:
-            raise ValueError(f"normal_gate_degrees is {self.normal_gate_degrees}, but must be in (0, 180]")
+            raise InputError(f"normal_gate_degrees is {self.normal_gate_degrees}, but must be in (0, 180]")
         if self.num_refinements < 0:
-            raise ValueError(f"num_refinements is {self.num_refinements}, but cannot be negative")
+            raise InputError(f"num_refinements is {self.num_refinements}, but cannot be negative")
         if self.min_inliers < 3:
-            raise ValueError(f"min_inliers is {self.min_inliers}, but any three matches agree: ask for more")
+            raise InputError(f"min_inliers is {self.min_inliers}, but any three matches agree: ask for more")
         if not 0 <= self.min_inlier_share <= 1:
-            raise ValueError(f"min_inlier_share is {self.min_inlier_share}, but must be in [0, 1]")
-        if not 0 < self.mode_degrees < 180 or not self.mode_distance > 0:
-            raise ValueError(
-                f"mode_degrees is {self.mode_degrees}, but must be in (0, 180), and mode_distance is"
-                f" {self.mode_distance}, but must be above zero"
-            )
+            raise InputError(f"min_inlier_share is {self.min_inlier_share}, but must be in [0, 1]")
 
     @property
     def refinement_gates(self) -> tuple[float, ...]:
@@ -101,10 +98,9 @@ def ransac(key: ArrayInput, matches: Matches, config: RansacConfig = RansacConfi
 def ransac_modes(key: ArrayInput, matches: Matches, count: int, config: RansacConfig = RansacConfig()) -> PoseResult:
     """Return `count` poses that differ, best first, with a leading axis in all fields: what `ransac` chose among.
 
-    Each is the best one left whose rotation differs by more than `mode_degrees`, or whose place of the matched points'
-    mean by more than `mode_distance` diameters, from those before. Nearly symmetric parts have several; which one is
-    right is for the surface to say. The first is that of `ransac`, up to rounding. Errors as there, and for a count
-    below 1.
+    Each is the best one left whose rotation differs by more than 30 degrees, or whose place of the matched points' mean
+    by more than 0.15 diameters, from those before. Nearly symmetric parts have several; which one is right is for the
+    surface to say. The first is that of `ransac`, up to rounding. Errors as there, and for a count below 1.
     """
     if count < 1:
         raise InputError(f"count is {count}, but at least one pose is needed")
@@ -198,7 +194,7 @@ def _ransac(key: PRNGKey, matches: Matches, config: RansacConfig, num_modes: int
     def next_mode(score: Int[Array, " h"], _: None) -> tuple[Int[Array, " h"], tuple[Pose, Bool[Array, ""]]]:
         row = jnp.argmax(score)
         mode, _ = jax.lax.scan(refine, poses[row], gates)
-        return jnp.where(_differ(poses, mode, config), score, -1), (mode, score[row] >= 0)
+        return jnp.where(_differ(poses, mode), score, -1), (mode, score[row] >= 0)
 
     start = jnp.where(is_candidate, counts, -1)
     _, (modes, there) = jax.lax.scan(next_mode, start, length=num_modes)
@@ -212,16 +208,14 @@ def _ransac(key: PRNGKey, matches: Matches, config: RansacConfig, num_modes: int
         pose = from_rotation_translation(
             best[:3, :3], unit * best[:3, 3] + scene_centre - (best[:3, :3] * object_centre[None, :]).sum(axis=1)
         )
-        conditions = [
+        status = first_status(
             (~input_is_valid, PoseStatus.INVALID_INPUT),
             (num_usable < 3, PoseStatus.TOO_FEW_MATCHES),
             (~is_candidate.any(), PoseStatus.DEGENERATE),
             (~is_there | (num_inliers < required), PoseStatus.NO_CONSENSUS),
             (~spread, PoseStatus.DEGENERATE),
             (~jnp.isfinite(pose).all(), PoseStatus.INVALID_INPUT),
-        ]
-        codes = [jnp.int32(code) for _, code in conditions]
-        status = jnp.select([test for test, _ in conditions], codes, PoseStatus.OK)
+        )
         converged = status == PoseStatus.OK
         squared_error = jnp.where(inlier_mask, squares, 0).sum() / jnp.maximum(num_inliers, 1).astype(jnp.float32)
         return PoseResult(
@@ -237,11 +231,11 @@ def _ransac(key: PRNGKey, matches: Matches, config: RansacConfig, num_modes: int
     return jax.vmap(finish)(modes, there)
 
 
-def _differ(poses: Float[Array, "h 4 4"], pose: Pose, config: RansacConfig) -> Bool[Array, " h"]:
+def _differ(poses: Float[Array, "h 4 4"], pose: Pose) -> Bool[Array, " h"]:
     """Return which poses of centred points, in diameters, are another mode than the given one."""
     trace = (poses[:, :3, :3] * pose[None, :3, :3]).sum(axis=(1, 2))
-    turned = trace < 1 + 2 * cos(radians(config.mode_degrees))
-    moved = ((poses[:, :3, 3] - pose[None, :3, 3]) ** 2).sum(axis=1) > config.mode_distance**2
+    turned = trace < 1 + 2 * cos(radians(_MODE_DEGREES))
+    moved = ((poses[:, :3, 3] - pose[None, :3, 3]) ** 2).sum(axis=1) > _MODE_DISTANCE**2
     return turned | moved
 
 

@@ -6,7 +6,11 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from kmn_jax.errors import InputError
 
 
 class PoseStatus(IntEnum):
@@ -39,6 +43,12 @@ _REASONS = {
 }
 
 
+def first_status(*conditions: tuple[Bool[Array, ""], PoseStatus]) -> Int[Array, ""]:
+    """Return the status of the first condition that is true, OK if none is."""
+    tests, codes = zip(*conditions, strict=True)
+    return jnp.select(tests, [jnp.int32(code) for code in codes], PoseStatus.OK)
+
+
 class PoseResult(NamedTuple):
     """Pose of an object in the scene, or the reason why there is none, as arrays (batched by vmap).
 
@@ -59,5 +69,5 @@ class PoseResult(NamedTuple):
         """Return in words how the search of a single (not batched) result ended."""
         status = np.asarray(self.status)
         if status.ndim:
-            raise ValueError(f"{status.size} results are batched here: take the reason of one, PoseStatus(status[i])")
+            raise InputError(f"{status.size} results are batched here: take the reason of one, PoseStatus(status[i])")
         return PoseStatus(int(status)).reason

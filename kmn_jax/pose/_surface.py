@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from kmn_jax.errors import InputError
 from kmn_jax.geometry import first_smallest, inverse, squared_distances, transform_points
 from kmn_jax.typing import Mask, Normals, Points, Pose, Scalar
 
@@ -27,7 +28,7 @@ class SurfaceConfig:
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
         if not self.tolerance > 0 or not -1 <= self.min_cosine < 1 or not 0 <= self.facing < 1:
-            raise ValueError(
+            raise InputError(
                 f"tolerance = {self.tolerance} must be above zero, min_cosine = {self.min_cosine} in [-1, 1) and"
                 f" facing = {self.facing} in [0, 1)"
             )

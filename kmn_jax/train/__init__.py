@@ -13,7 +13,6 @@ from kmn_jax.train._sharding import (
     jit_make_samples,
     jit_train_step,
     put_batch,
-    put_number,
     put_whole,
     split_cpu,
 )
@@ -37,7 +36,6 @@ __all__ = [
     "jit_train_step",
     "mean_metrics",
     "put_batch",
-    "put_number",
     "put_whole",
     "read_metrics",
     "rendered_frames",

@@ -6,43 +6,38 @@ import hashlib
 import json
 import re
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from kmn_jax.errors import InputError
-from kmn_jax.train._snapshot import Packed, Snapshot, check_fit, from_first_process, join, pack, read_layout, unpack
+from kmn_jax.train._sharding import from_first_process
+from kmn_jax.train._snapshot import Packed, Snapshot, check_fit, pack, unpack
 from kmn_jax.train._step import TrainState
 
 _NAME = re.compile(r"step-(\d{8,})(?:-(\d+))?(-best)?")
 _STATE, _RECORD = "state", "record.json"
-
-
-def print_report(message: str) -> None:
-    """Print to stderr."""
-    print(message, file=sys.stderr, flush=True)
+_KEPT = 2  # of the latest, beside the best one
 
 
 class Checkpoints:
     """The latest snapshots of a run and the best one, in a folder of their own.
 
-    A process that is killed at any moment leaves the snapshots that were there. Each carries SHA-256 digests of its
-    files and of its arrays, which are checked when it is read: a damaged one is reported, and the one before is used.
+    A process that is killed at any moment leaves the snapshots that were there. Each carries the SHA-256 of all of its
+    files, which are checked when it is read: a damaged one is reported, and the one before is used.
 
     If a run has several processes, all call the same methods at the same steps, and the first one alone reads and
     writes the folder.
     """
 
-    def __init__(self, folder: str | Path, keep: int = 2, report: Callable[[str], None] = print_report) -> None:
+    def __init__(self, folder: str | Path, report: Callable[[str], None] = print) -> None:
         """Use `folder`, which need not exist yet; `report` is told what was skipped and why."""
-        if keep < 1:
-            raise InputError(f"keep = {keep} must be at least 1")
-        self.folder, self.keep, self._report = Path(folder).absolute(), keep, report
+        self.folder, self._report = Path(folder).absolute(), report
         self._damaged: set[str] = set()  # names of checkpoints that could not be read
 
     @property
@@ -51,7 +46,7 @@ class Checkpoints:
         return sorted({entry.step for entry in self._entries()})
 
     def save(self, snapshot: Snapshot, best: bool = False) -> None:
-        """Write a snapshot, then remove those that are neither the `keep` latest nor the latest that was `best`.
+        """Write a snapshot, then remove those that are neither the two latest nor the latest that was `best`.
 
         Checkpoints that this object found damaged are removed too. One of the same step is replaced.
 
@@ -59,11 +54,7 @@ class Checkpoints:
             InputError: the folder cannot be written to or holds a later checkpoint that is not known to be damaged.
         """
         packed = pack(snapshot)
-
-        def write() -> None:
-            self._write(packed, best)
-
-        from_first_process(write)
+        from_first_process(lambda: self._write(packed, best))
 
     def latest(self, like: TrainState) -> Snapshot | None:
         """Return the newest snapshot that is whole, or None; its arrays are placed as those of `like`.
@@ -98,15 +89,14 @@ class Checkpoints:
                 self._report(f"{entry.path} is damaged and is not used: {reason}")
                 continue
             try:
-                packed = _read(entry.path, record)
-                check_fit(packed, like)
+                check_fit(record, like)
             except InputError as error:
                 raise InputError(f"{entry.path}: {error}") from None
-            return packed
+            return Packed(_read_arrays(entry.path, record["layout"]), record)
         return None
 
     def _write(self, packed: Packed, best: bool) -> None:
-        step, entries = packed.step, self._entries()
+        step, entries = int(packed.arrays["step"]), self._entries()
         for entry in entries:
             if entry.step > step and entry.path.name not in self._damaged:
                 raise InputError(
@@ -128,7 +118,7 @@ class Checkpoints:
         entries = self._entries()
         whole = [entry for entry in entries if entry.path.name not in self._damaged]
         newest = {entry.step: entry for entry in reversed(whole)}  # the last edition of each step
-        kept = {newest[step].path for step in sorted(newest)[-self.keep :]}
+        kept = {newest[step].path for step in sorted(newest)[-_KEPT:]}
         kept |= {entry.path for entry in [entry for entry in whole if entry.best][:1]}
         for entry in entries:
             if entry.path not in kept:
@@ -176,7 +166,7 @@ def _save(path: Path, packed: Packed) -> None:
     with _checkpointer() as checkpointer:
         checkpointer.save(staging / _STATE, args=ocp.args.PyTreeSave(arrays))
     files = {str(file.relative_to(staging)): _sha256(file) for file in sorted(staging.rglob("*")) if file.is_file()}
-    content = json.dumps({"record": packed.record(), "files": files})
+    content = json.dumps({"record": packed.record, "files": files})
     stored = {"sha256": hashlib.sha256(content.encode()).hexdigest(), "content": content}
     (staging / _RECORD).write_text(json.dumps(stored), encoding="utf-8")
     staging.rename(path)
@@ -195,15 +185,13 @@ def _checked_record(path: Path) -> dict[str, Any]:
     return record
 
 
-def _read(path: Path, record: dict[str, Any]) -> Packed:
+def _read_arrays(path: Path, layout: dict[str, Any]) -> dict[str, np.ndarray]:
     import orbax.checkpoint as ocp
 
-    layout = read_layout(record)
-    arrays = {name: np.zeros(shape, dtype) for name, (dtype, shape) in layout.items() if 0 in shape}
+    arrays = {name: np.zeros(shape, jnp.dtype(dtype)) for name, (dtype, shape) in layout.items() if 0 in shape}
     wanted = {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in layout if name not in arrays}
     with _checkpointer() as checkpointer:
-        arrays |= checkpointer.restore(path / _STATE, args=ocp.args.PyTreeRestore(restore_args=wanted))
-    return join(record, arrays)
+        return arrays | checkpointer.restore(path / _STATE, args=ocp.args.PyTreeRestore(restore_args=wanted))
 
 
 def _checkpointer() -> Any:

@@ -28,7 +28,7 @@ class TrainConfig:
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
     crops_at_once: int | None = None  # that a device computes side by side; None: all of its share of a batch
     average_decay: float = 0.0  # of the running mean of the parameters that is evaluated and shipped; 0: the last ones
-    seed: int = 0
+    random_seed: int = 0
     training_share: float = 1.0  # of the pack's training objects, spread evenly over its list
     validate_every: int = 1000  # steps
     validation_samples: int = 20  # of each validation object
@@ -39,18 +39,14 @@ class TrainConfig:
         for name in ("num_steps", "validate_every", "validation_samples", "checkpoint_every", "log_every"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)} must be at least 1")
-        if not 0 <= self.seed < 2**32:
-            raise InputError(f"seed = {self.seed} must be from 0 to 2**32 - 1")
+        if not 0 <= self.random_seed < 2**32:
+            raise InputError(f"random_seed = {self.random_seed} must be from 0 to 2**32 - 1")
         if not 0 < self.training_share <= 1:
             raise InputError(f"training_share = {self.training_share} must be above 0 and up to 1")
         if self.rendered is not None and self.training_share < 1:
             raise InputError(
                 f"training_share = {self.training_share} is of the pack's objects, but rendered = {self.rendered} has"
                 " its own: leave one of them"
-            )
-        if self.pipeline.epochs is not None:
-            raise InputError(
-                f"pipeline.epochs = {self.pipeline.epochs}, but num_steps says how long a run is: leave it"
             )
         if self.validation_samples % self.pipeline.crops_per_object:
             raise InputError(
@@ -84,5 +80,5 @@ class TrainConfig:
             crops_per_object=self.pipeline.crops_per_object,
             crops_at_once=self.crops_at_once,
             average_decay=self.average_decay,
-            seed=self.seed,
+            random_seed=self.random_seed,
         )

@@ -3,8 +3,8 @@
 The only module of training that acts: it draws batches, dispatches steps, writes files and listens to signals.
 
 A run's folder holds `config.json`; `sessions.jsonl`, with commit, versions and devices; `metrics.jsonl`, the same as
-`metrics.csv` and for TensorBoard in `events/`; `checkpoints/`; `model.safetensors`, the running mean of the parameters
-at the lowest validation loss, and `last.safetensors`, at the last stop.
+`metrics.csv`; `checkpoints/`; `model.safetensors`, the running mean of the parameters at the lowest validation loss,
+and `last.safetensors`, at the last stop. A copy of the folder can be resumed as well.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,30 +28,29 @@ from kmn_jax.data import BatchIterator, SampleIndex
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
 from kmn_jax.models import model_structure, save_model
+from kmn_jax.report import check_target
 from kmn_jax.train._checkpoint import Checkpoints
 from kmn_jax.train._config import TrainConfig
-from kmn_jax.train._records import MetricFiles, check_config, check_same, write_config, write_session
+from kmn_jax.train._records import add_metrics, begin_metrics, check_same, write_config, write_session
 from kmn_jax.train._sharding import (
     any_process,
     check_batch,
     data_mesh,
+    from_first_process,
     jit_eval_step,
     jit_train_step,
     put_batch,
-    put_number,
     put_whole,
 )
-from kmn_jax.train._snapshot import Snapshot, from_first_process
+from kmn_jax.train._snapshot import Snapshot
 from kmn_jax.train._sources import ignore, trained_network, training_source, validation_source
 from kmn_jax.train._step import Metrics, Samples, create_state, index_of, mean_metrics, total_sums
 from kmn_jax.train._stop import StopRequest
-from kmn_jax.train._transfer import FILE_LIMIT, MANIFEST, export_snapshot, import_snapshot
 from kmn_jax.train._window import MEANS, Window
 
 # What a resumed run may change: how long it is, where its pack lies, what it writes when, and the share of examples
 # with random keypoints, as the last steps may be spent on those that the estimator uses.
 _FREE = ("name", "pack", "num_steps", "validate_every", "checkpoint_every", "log_every", "examples.random_keypoints")
-_CARRIED = ("metrics.jsonl", "sessions.jsonl", "model.safetensors")  # go with an export
 _READERS = 4  # threads that read images ahead
 _AHEAD = 2  # steps that are dispatched before the metrics of one are read
 
@@ -85,15 +83,12 @@ def train(
     *,
     max_minutes: float | None = None,
     resume: bool = False,
-    import_from: str | Path | None = None,
-    export_to: str | Path | None = None,
     progress: bool = True,
     report: Callable[[str], None] | None = None,
 ) -> Outcome:
     """Train, from the beginning or with `resume` from the last checkpoint, until done or told to stop.
 
-    SIGTERM, SIGINT and `max_minutes` stop it between two steps, with everything saved. `import_from` begins with an
-    exported snapshot, in a new folder; `export_to` writes one of where the run stopped. Messages go to `report`, by
+    SIGTERM, SIGINT and `max_minutes` stop it between two steps, with everything saved. Messages go to `report`, by
     default to stdout, above the progress bar.
 
     Raises:
@@ -104,38 +99,17 @@ def train(
     folder = Path(folder)
     stop = StopRequest(max_minutes)
     # By one process, or the others might find what it has just written.
-    from_first_process(lambda: _check(folder, config, resume, import_from, export_to))
+    from_first_process(lambda: _check_free(folder, resume))
     run = _Run(config, folder, data_mesh(), stop, report or _print)
-    run.restore(import_from)
+    run.restore()
     with stop:
-        outcome = run.loop(progress)
-    if export_to is not None and run.first:
-        run.export(Path(export_to))
-    return outcome
+        return run.loop(progress)
 
 
-def _check(
-    folder: Path, config: TrainConfig, resume: bool, import_from: str | Path | None, export_to: str | Path | None
-) -> None:
-    """See that the folder holds this run or none, before anything takes time."""
-    exists = any((folder / "checkpoints").glob("*"))  # without one there is nothing to lose
-    if exists and import_from is not None:
-        raise InputError(f"{folder} holds a run already: resume it without importing, or import into another folder")
-    if exists and not resume:
+def _check_free(folder: Path, resume: bool) -> None:
+    # Without a checkpoint there is nothing to lose.
+    if not resume and any((folder / "checkpoints").glob("*")):
         raise InputError(f"{folder} holds a run: resume it, or choose another folder")
-    if export_to is not None and (Path(export_to) / MANIFEST).exists():
-        raise InputError(f"{export_to} holds an export already: choose another folder to export to")
-    if exists and (folder / "config.json").exists():
-        check_config(folder, asdict(config), _FREE)
-    if export_to is not None:
-        _make_folder(Path(export_to))
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot make the folder {folder}: {error.strerror}") from None
 
 
 class _Run:
@@ -171,26 +145,21 @@ class _Run:
         self.seconds_before, self.began = 0.0, time.monotonic()
         self.window = Window()
 
-    def restore(self, import_from: str | Path | None) -> None:
-        """Go on from an exported snapshot or the last checkpoint, if there is one."""
-        found = self.checkpoints.latest(self.state) if import_from is None else import_snapshot(import_from, self.state)
+    def restore(self) -> None:
+        """Go on from the last checkpoint, if there is one."""
+        found = self.checkpoints.latest(self.state)
         if found is None:
             from_first_process(self._check_none)
-        _make_folder(self.folder)
-        if found is not None and import_from is None:
-            check_same(f"{self.folder}", found.facts.get("config", {}), asdict(self.config), _FREE)
-        if found is not None:
+        else:
+            check_same(self.folder, found.facts.get("config", {}), asdict(self.config), _FREE)
             self._take(found)
             self.report(f"going on at step {self.step} of {self.config.num_steps}")
-        if import_from is not None:
-            self._save(best=False)  # before there is a config: a run that can be resumed must not begin anew
         if self.first:
-            for name in _CARRIED if import_from is not None else ():
-                if (Path(import_from or "") / name).exists():
-                    shutil.copyfile(Path(import_from or "") / name, self.folder / name)
+            check_target(self.folder / "config.json")
             write_config(self.folder, asdict(self.config))
             facts = {"training_objects": len(self.training.names), "validation_objects": len(self.validation.names)}
             write_session(self.folder, self.step, facts)
+            begin_metrics(self.folder, self.step, self.validated)
 
     def _check_none(self) -> None:
         """See that a run without a usable checkpoint has none: it would begin anew and replace what can be mended."""
@@ -209,28 +178,13 @@ class _Run:
         quiet = not (progress and self.first)
         total, done = config.num_steps * size, self.step * size
         interval = 1.0 if sys.stderr.isatty() else 30.0
-        with ExitStack() as stack:
-            files = MetricFiles(self.folder, self.step, self.validated) if self.first else None
-            self.files = files and stack.enter_context(files)
-            self.bar = tqdm(total=total, initial=done, unit=" samples", disable=quiet, mininterval=interval)
-            stack.enter_context(self.bar)
-            self.window = Window(self.window.saved())
+        self.window = Window(self.window.saved())
+        with tqdm(total=total, initial=done, unit=" samples", disable=quiet, mininterval=interval) as self.bar:
             while not self._at_boundary():
                 self._advance()
         if self.first:
             save_model((self.saved_graphdef, self.state.average), self.folder / "last.safetensors")
         return Outcome(self.step, self.stopped, self.best_loss, self.best_step)
-
-    def export(self, folder: Path) -> None:
-        """Write where the run stands into a few files that another folder can import."""
-        paths = export_snapshot(self._snapshot(), folder)
-        for name in _CARRIED:
-            path = self.folder / name
-            if path.exists() and path.stat().st_size < FILE_LIMIT:
-                shutil.copyfile(path, folder / name)
-            elif path.exists():
-                self.report(f"{path} stays behind: it has {path.stat().st_size} bytes")
-        self.report(f"exported step {self.step} to {folder}, {len(paths)} files of state")
 
     def _at_boundary(self) -> bool:
         """Validate and save if it is time to, and tell whether the run ends here."""
@@ -257,7 +211,7 @@ class _Run:
     def _advance(self) -> None:
         state, samples = self.batches.get_state(), next(self.batches)
         with jax.transfer_guard("disallow"):
-            number = put_number(self.step, self.mesh)
+            number = put_whole(np.int32(self.step), self.mesh)
             batch = put_batch(samples, self.mesh)
             self.state, metrics = self.train_step(self.state, self.training.pack, batch, number)
             vote = any_process(bool(self.stop.reason), self.mesh)
@@ -315,9 +269,10 @@ class _Run:
         return bool(best)
 
     def _write(self, step: int, split: str, values: dict[str, float]) -> None:
-        if self.files is not None:
+        if self.first:
             seen = step * self.config.pipeline.batch_size
-            self.files.write({"step": step, "samples": seen, "split": split, **values, "seconds": self._seconds()})
+            facts: dict[str, float | str] = {"step": step, "samples": seen, "split": split}
+            add_metrics(self.folder, {**facts, **values, "seconds": self._seconds()})
 
     def _seconds(self) -> float:
         return self.seconds_before + time.monotonic() - self.began
@@ -365,14 +320,14 @@ class _Run:
             for name, drop, key in zip(names, done.samples.drop, done.samples.key, strict=True)
         ]
         facts = {"step": done.number, "loss": str(metrics.loss), "gradient_norm": str(metrics.gradient_norm)}
-        content = json.dumps({**facts, "samples": samples}, indent=1).encode()
-        _make_folder(apart)
-        write_whole(apart / f"batch{jax.process_index()}.json", content)
+        path = apart / f"batch{jax.process_index()}.json"
+        check_target(path)
+        write_whole(path, json.dumps({**facts, "samples": samples}, indent=1).encode())
         some = ", ".join(dict.fromkeys(names[: 4 * self.config.pipeline.crops_per_object]))
         raise NotFiniteError(
             f"step {done.number}, with the objects {some}, gave loss {metrics.loss} and gradient norm"
             f" {metrics.gradient_norm}: the state before it and the batch are in {apart}, the last checkpoint is as it"
-            " was; look for the cause there, or export the run and import it into another folder with other values"
+            " was; look for the cause there, or begin another run with other values"
         )
 
 

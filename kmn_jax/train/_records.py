@@ -1,4 +1,4 @@
-"""What a run writes about itself: its config, its sessions, and its metrics in three forms that survive a restart."""
+"""What a run writes about itself: its config, its sessions, and its metrics in two forms that survive a restart."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import jax
@@ -21,7 +20,6 @@ import jax
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
 from kmn_jax.report import commit, processor
-from kmn_jax.train._events import EventFile
 
 COLUMNS = (
     "step",
@@ -37,47 +35,33 @@ COLUMNS = (
     "samples_per_second",
     "seconds",
 )
+_LINES, _TABLE = "metrics.jsonl", "metrics.csv"
 _PACKAGES = ("kmn_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "numpy")
 
 Row = Mapping[str, float | int | str]
 
 
-class MetricFiles:
-    """`metrics.jsonl`, the same as `metrics.csv`, and TensorBoard event files in `events/`."""
+def begin_metrics(folder: Path, step: int, validated: int) -> None:
+    """Keep the rows up to a step, those of a run that goes on from there, and drop later ones and broken lines.
 
-    def __init__(self, folder: Path, step: int, validated: int) -> None:
-        """Keep the rows up to a step, those of a run that goes on from there, and drop later ones and broken lines.
+    Rows of validations are kept up to step `validated`.
+    """
+    last = {"validation": validated}
+    kept = [row for row in read_metrics(folder) if row["step"] <= last.get(str(row.get("split")), step)]
+    write_whole(folder / _LINES, "".join(json.dumps(row) + "\n" for row in kept).encode())
+    write_whole(folder / _TABLE, (",".join(COLUMNS) + "\n" + _csv(kept)).encode())
 
-        Rows of validations are kept up to step `validated`.
-        """
-        self._lines, self._table = folder / "metrics.jsonl", folder / "metrics.csv"
-        last = {"validation": validated}
-        kept = [row for row in read_metrics(folder) if row["step"] <= last.get(str(row.get("split")), step)]
-        write_whole(self._lines, "".join(json.dumps(row) + "\n" for row in kept).encode())
-        write_whole(self._table, _csv([dict.fromkeys(COLUMNS, "") | dict(row) for row in kept], header=True).encode())
-        self._events = EventFile(folder / "events", step + 1)
 
-    def write(self, row: Row) -> None:
-        """Append a row of some of the COLUMNS: `step` and `split` always."""
-        with self._lines.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(dict(row)) + "\n")
-        with self._table.open("a", encoding="utf-8", newline="") as file:
-            file.write(_csv([row], header=False))
-        values = {f"{row['split']}/{name}": value for name, value in row.items() if isinstance(value, float)}
-        self._events.scalars(int(row["step"]), values)
-
-    def __enter__(self) -> MetricFiles:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._events.close()
+def add_metrics(folder: Path, row: Row) -> None:
+    """Append a row of some of the COLUMNS, `step` and `split` always, to `metrics.jsonl` and `metrics.csv`."""
+    for name, text in ((_LINES, json.dumps(dict(row)) + "\n"), (_TABLE, _csv([row]))):
+        with (folder / name).open("a", encoding="utf-8") as file:
+            file.write(text)
 
 
 def read_metrics(folder: str | Path) -> list[dict[str, Any]]:
     """Return the rows of a run's `metrics.jsonl`, without lines that were half written; none if there is no file."""
-    path = Path(folder) / "metrics.jsonl"
+    path = Path(folder) / _LINES
     if not path.exists():
         return []
     rows = []
@@ -96,23 +80,11 @@ def write_config(folder: Path, config: Mapping[str, Any]) -> None:
     write_whole(folder / "config.json", json.dumps(config, indent=1).encode() + b"\n")
 
 
-def check_config(folder: Path, config: Mapping[str, Any], free: tuple[str, ...] = ()) -> None:
-    """Raise InputError if `config.json` is broken or differs in more than the `free` names.
-
-    Dots join the names of nested values.
-    """
-    path = folder / "config.json"
-    try:
-        old = dict(json.loads(path.read_text(encoding="utf-8")))
-    except (AttributeError, TypeError, ValueError) as error:
-        raise InputError(f"{path} is broken ({error}): restore it, or choose another folder") from None
-    check_same(f"{folder}", old, config, free)
-
-
-def check_same(folder: str, old: Mapping[str, Any], new: Mapping[str, Any], free: tuple[str, ...] = ()) -> None:
+def check_same(folder: Path, old: Mapping[str, Any], new: Mapping[str, Any], free: tuple[str, ...]) -> None:
     """Raise InputError if the config of a run differs from a new one in more than the `free` names.
 
-    Names that the old one lacks, because an earlier version knew none of them, are passed over.
+    Dots join the names of nested values. Names that the old one lacks, because an earlier version knew none of them,
+    are passed over.
     """
     old, new = _flat(dict(old)), _flat(json.loads(json.dumps(new)))
     changed = [name for name in sorted(old) if old[name] != new.get(name) and name not in free]
@@ -146,11 +118,9 @@ def _version(name: str) -> str | None:
         return None
 
 
-def _csv(rows: list[Row] | list[dict[str, Any]], header: bool) -> str:
+def _csv(rows: Sequence[Row]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
-    if header:
-        writer.writeheader()
     writer.writerows({name: _short(value) for name, value in row.items()} for row in rows)
     return text.getvalue()
 

@@ -7,14 +7,15 @@ sum of the gradients. (Left to the shardings of jit alone, XLA also gathers scen
 from __future__ import annotations
 
 import os
+import pickle
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from typing import Any, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
@@ -34,7 +35,7 @@ from kmn_jax.train._step import (
     train_step,
 )
 
-TrainStep = Callable[[TrainState, DevicePack, Samples, Int[Array, ""]], tuple[TrainState, Metrics]]
+TrainStep = Callable[[TrainState, DevicePack, Samples, Int[Array, ""] | np.int32], tuple[TrainState, Metrics]]
 EvalStep = Callable[[nnx.State, DevicePack, Samples], Sums]
 
 _AXIS = "data"
@@ -153,11 +154,6 @@ def put_whole(tree: _T, mesh: Mesh) -> _T:
     return _put(tree, _shardings(mesh)[0])
 
 
-def put_number(value: int, mesh: Mesh) -> Int[Array, ""]:
-    """Put a whole number on every device."""
-    return jnp.asarray(_put(np.asarray(value, np.int32), _shardings(mesh)[0]))
-
-
 def put_batch(samples: Samples, mesh: Mesh) -> Samples:
     """Spread a batch over the devices. Every process gives its own share."""
     return _put(samples, _shardings(mesh)[1])
@@ -169,6 +165,37 @@ def any_process(flag: bool, mesh: Mesh) -> Array | bool:
         return flag
     whole, shared = _shardings(mesh)
     return _any(_put(np.full(mesh.local_mesh.size, flag), shared), whole)
+
+
+def from_first_process(make: Callable[[], _T]) -> _T:
+    """Return on all processes what `make` returns on the first, or raise what it raises there, elsewhere as InputError.
+
+    All processes must call this; only the first calls `make`.
+    """
+    if jax.process_count() == 1:
+        return make()
+    made: _T | None = None
+    error: Exception | None = None
+    if jax.process_index() == 0:
+        try:
+            made = make()
+        except Exception as caught:  # the others wait to hear of it
+            error = caught
+    value: _T
+    value, problem = pickle.loads(_broadcast(pickle.dumps((made, error and str(error)))))
+    if error is not None:
+        raise error
+    if problem is not None:
+        raise InputError(problem)
+    return value
+
+
+def _broadcast(content: bytes) -> bytes:
+    """Return the first process's content."""
+    # Bytes, since the broadcast is a sum, which turns -0.0 into 0.0 and may touch NaN.
+    size = int(multihost_utils.broadcast_one_to_all(np.int32(len(content))))
+    own = np.frombuffer(content, np.uint8) if jax.process_index() == 0 else np.zeros(size, np.uint8)
+    return np.asarray(multihost_utils.broadcast_one_to_all(own)).tobytes()
 
 
 def _shardings(mesh: Mesh) -> tuple[NamedSharding, NamedSharding]:

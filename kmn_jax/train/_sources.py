@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 from jax.sharding import Mesh
+from jaxtyping import Int32
 
-from kmn_jax.data import DevicePack, Pack, PipelineConfig, SampleBatches, SampleIndex, StackedPack, stack_pack
+from kmn_jax.data import DevicePack, Pack, PipelineConfig, SampleBatches, SampleIndex, stack_pack
 from kmn_jax.errors import InputError
 from kmn_jax.models import KeyMatchNetConfig
 from kmn_jax.train._config import TrainConfig
@@ -43,20 +44,20 @@ def training_source(config: TrainConfig, mesh: Mesh, report: Report = ignore) ->
     What is left out goes to `report`, of images also while they are read.
     """
     if config.rendered is not None:
-        return _rendered_source(config, config.rendered, mesh, report)
+        frames = rendered_frames(config.rendered, config.rendered_split, config.network, config.examples.crops, report)
+        batches = _own_batches(config.pipeline, frames.num_frames, 1)
+        return Source(put_whole(frames.pack, mesh), frames.names, frames.digest, batches, frames.read)
     pack = Pack(config.pack)
     names = pack.names("train")
     count = max(1, round(config.training_share * len(names)))
     chosen = [names[row * len(names) // count] for row in range(min(count, len(names)))]
-    stacked = stack_pack(pack, chosen if names else "train", _with_bits(config))
-    return _source(config, stacked, config.pipeline, mesh, report, ordered=False)
+    return _packed_source(config, pack, chosen if names else "train", config.pipeline, mesh, report)
 
 
 def validation_source(config: TrainConfig, mesh: Mesh, report: Report = ignore) -> Source:
     """Return the validation objects and their fixed samples, in order, as one pass; see `training_source`."""
-    stacked = stack_pack(Pack(config.pack), "validation", _with_bits(config))
-    pipeline = replace(config.pipeline, samples_per_object=config.validation_samples, seed=_VALIDATION_SEED)
-    return _source(config, stacked, pipeline, mesh, report, ordered=True)
+    pipeline = replace(config.pipeline, samples_per_object=config.validation_samples, random_seed=_VALIDATION_SEED)
+    return _packed_source(config, Pack(config.pack), "validation", pipeline, mesh, report, ordered=True)
 
 
 def trained_network(config: TrainConfig) -> KeyMatchNetConfig:
@@ -75,45 +76,29 @@ def trained_network(config: TrainConfig) -> KeyMatchNetConfig:
     return replace(config.network, object_digest=digests.pop())
 
 
-def _check_surfels(config: TrainConfig, stacked: StackedPack) -> None:
-    """See before anything is written that the steps can be compiled."""
-    found, needed = stacked.arrays.points.shape[1], config.network.num_object_points
-    if found < needed:
-        raise InputError(
-            f"the pack {config.pack} has {found} surfels an object, but network.num_object_points = {needed}: choose"
-            " fewer, or build a pack with more"
-        )
-
-
-def _with_bits(config: TrainConfig) -> bool:
-    return config.examples.visibility == "bits"
-
-
-def _source(
+def _packed_source(
     config: TrainConfig,
-    stacked: StackedPack,
+    pack: Pack,
+    objects: str | list[str],
     pipeline: PipelineConfig,
     mesh: Mesh,
     report: Report,
-    ordered: bool,
+    ordered: bool = False,
 ) -> Source:
-    _check_surfels(config, stacked)
+    stacked = stack_pack(pack, objects, config.examples.visibility == "bits")
+    arrays, needed = stacked.arrays, config.network.num_object_points
+    if arrays.points.shape[1] < needed:  # before anything is written: steps could not be compiled
+        raise InputError(
+            f"the pack {config.pack} has {arrays.points.shape[1]} surfels an object, but network.num_object_points ="
+            f" {needed}: choose fewer, or build a pack with more"
+        )
     for problem in stacked.problems:
         report(problem)
-    batches = SampleBatches(
-        pipeline,
-        len(stacked.names),
-        np.asarray(stacked.arrays.num_drops),
-        shard_index=jax.process_index(),
-        shard_count=jax.process_count(),
-        ordered=ordered,
-    )
-    return Source(put_whole(stacked.arrays, mesh), stacked.names, stacked.digest, batches)
+    batches = _own_batches(pipeline, len(stacked.names), np.asarray(arrays.num_drops), ordered)
+    return Source(put_whole(arrays, mesh), stacked.names, stacked.digest, batches)
 
 
-def _rendered_source(config: TrainConfig, folder: str, mesh: Mesh, report: Report) -> Source:
-    frames = rendered_frames(folder, config.rendered_split, config.network, config.examples.crops, report)
-    batches = SampleBatches(
-        config.pipeline, frames.num_frames, 1, shard_index=jax.process_index(), shard_count=jax.process_count()
-    )
-    return Source(put_whole(frames.pack, mesh), frames.names, frames.digest, batches, frames.read)
+def _own_batches(
+    pipeline: PipelineConfig, count: int, num_drops: int | Int32[np.ndarray, " o"], ordered: bool = False
+) -> SampleBatches:
+    return SampleBatches(pipeline, count, num_drops, jax.process_index(), jax.process_count(), ordered)

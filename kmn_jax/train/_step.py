@@ -31,7 +31,7 @@ class StepConfig:
     crops_per_object: int  # consecutive samples of a batch that share an object, and its encoding
     crops_at_once: int | None  # that a device computes side by side, the rest one after the other; None: all
     average_decay: float  # of the running mean of the parameters, which is what is evaluated and shipped
-    seed: int
+    random_seed: int
 
     def __post_init__(self) -> None:
         if not 0 <= self.average_decay < 1:
@@ -92,7 +92,7 @@ SumGradients: TypeAlias = Callable[[nnx.State, DevicePack, Samples, Array], tupl
 
 def create_state(config: StepConfig, optimizer: optax.GradientTransformation) -> tuple[nnx.GraphDef, TrainState]:
     """Return the network's structure and the state before the first step."""
-    graphdef, parameters = create_model(config.network, jax.random.key(config.seed))
+    graphdef, parameters = create_model(config.network, jax.random.key(config.random_seed))
     state = TrainState(jnp.int32(0), parameters, jax.tree.map(jnp.copy, parameters), optimizer.init(parameters))
     return graphdef, state
 
@@ -114,7 +114,7 @@ def train_step(
     `spread` may have the sums over the batch computed by several devices.
     """
     groups = index_of(samples).object.shape[0] // config.crops_per_object
-    dropout = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.step), groups)
+    dropout = jax.random.split(jax.random.fold_in(jax.random.key(config.random_seed), state.step), groups)
     grads, sums = spread(partial(sum_gradients, graphdef, config))(state.parameters, pack, samples, dropout)
     count = jnp.maximum(sums.num_crops, 1)
     grads = jax.tree.map(lambda leaf: leaf / count, grads)
@@ -197,10 +197,7 @@ def make_samples(config: StepConfig, pack: DevicePack, samples: Samples) -> Grou
 class _Chunk(NamedTuple):
     """Groups that are computed side by side: c of them, g samples each."""
 
-    row: Int[Array, " c"]
-    drops: Int[Array, "c g"]
-    keys: UInt32[Array, "c g 2"]
-    counted: Bool[Array, "c g"]
+    which: SampleIndex  # (c, g) in place of (b,)
     rendered: RenderedCrops | None
     dropout: PRNGKey | None
 
@@ -225,11 +222,9 @@ def _chunks(samples: Samples, dropout: Key[Array, " groups"] | None, config: Ste
     if size % each or groups % at_once:
         raise InputError(f"a batch of {size} must hold whole chunks of {at_once} groups of crops_per_object = {each}")
     shape = (groups // at_once, at_once, each)
-    rows, drops, counted = (jnp.asarray(array).reshape(shape) for array in (index.object, index.drop, index.mask))
-    keys = jnp.asarray(index.key).reshape(*shape, 2)
-    crops = samples.crops if isinstance(samples, RenderedSamples) else None
-    rendered = jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(*shape, *leaf.shape[1:]), crops)
-    return _Chunk(rows[..., 0], drops, keys, counted, rendered, None if dropout is None else dropout.reshape(shape[:2]))
+    rendered = samples.crops if isinstance(samples, RenderedSamples) else None
+    index, rendered = jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(*shape, *leaf.shape[1:]), (index, rendered))
+    return _Chunk(index, rendered, None if dropout is None else dropout.reshape(shape[:2]))
 
 
 def index_of(samples: Samples) -> SampleIndex:
@@ -245,7 +240,8 @@ def _make(pack: DevicePack, chunk: _Chunk, config: StepConfig, examples: Example
     ) -> Group:
         return make_group(pack, row, drops, keys, config.network, examples, rendered)
 
-    return jax.lax.stop_gradient(jax.vmap(one)(chunk.row, chunk.drops, chunk.keys, chunk.rendered))
+    rows, drops, keys = (jnp.asarray(array) for array in chunk.which[:3])
+    return jax.lax.stop_gradient(jax.vmap(one)(rows[:, 0], drops, keys, chunk.rendered))
 
 
 def _dropout_keys(
@@ -262,7 +258,7 @@ def _parts(groups: Group, chunk: _Chunk, keys: Key[Array, "c g"] | None, config:
     """Split the crops of a chunk's groups into parts along a new first axis."""
     each = config.crops_per_object
     at_once = min(config.crops_at_once or each, each)
-    weight = (groups.valid & chunk.counted).astype(jnp.float32)
+    weight = (groups.valid & chunk.which.mask).astype(jnp.float32)
     whole = _Part(groups.crops, groups.mask, groups.is_object, groups.keypoint, weight, keys)
 
     def split(array: Array) -> Array:

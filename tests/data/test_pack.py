@@ -31,9 +31,6 @@ def packed_object(name: str = "Family/part_1,0", split: str = "train", seed: int
         area=SIZE**2,
         points=points.astype(np.float32),
         normals=(normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
-        symmetry_rotations=np.stack([np.eye(3), np.diag([1.0, -1, -1])]),
-        symmetry_axes=np.zeros((0, 3)),
-        symmetry_center=points.mean(axis=0),
         drops=tuple(
             Drop(
                 scene,
@@ -76,8 +73,6 @@ def test_reads_back_what_was_written_to_16_and_8_bits(pack: Pack) -> None:
     angles = np.degrees(np.arccos(np.clip((read.normals * item.normals).sum(axis=1), -1, 1)))
     assert angles.max() < 1.0  # degrees, of eight bits on the octahedron
     np.testing.assert_allclose(np.linalg.norm(read.normals, axis=1), 1, atol=1e-6)
-    np.testing.assert_array_equal(read.symmetry_rotations, item.symmetry_rotations)
-    np.testing.assert_array_equal(read.symmetry_center, item.symmetry_center)
     for there, here in zip(read.drops, item.drops, strict=True):
         np.testing.assert_array_equal(there.bits, here.bits)
         np.testing.assert_array_equal(there.bin_bits, here.bin_bits)

@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 
 from kmn_jax.data import BatchIterator, PipelineConfig, SampleBatches, SampleIndex
-from kmn_jax.data._pipeline import index_dataset
 from kmn_jax.errors import InputError
 
-CONFIG = PipelineConfig(batch_size=6, samples_per_object=8, crops_per_object=2, seed=3)
+CONFIG = PipelineConfig(batch_size=6, samples_per_object=8, crops_per_object=2, random_seed=3)
 OBJECTS, DROPS = 5, 4
 EPOCH = 40  # samples, so 6 full batches and 4 samples
 
@@ -46,7 +45,7 @@ def test_same_config_gives_same_batches_in_any_order() -> None:
     forwards, backwards = batches(), batches()
     later = [backwards[number] for number in reversed(range(20))][::-1]
     assert all(equal(forwards[number], later[number]) for number in range(20))
-    other = batches(PipelineConfig(batch_size=6, samples_per_object=8, crops_per_object=2, seed=4))
+    other = batches(PipelineConfig(batch_size=6, samples_per_object=8, crops_per_object=2, random_seed=4))
     assert not set(rows(forwards[number] for number in range(20))) & set(rows(other[number] for number in range(20)))
 
 
@@ -72,7 +71,7 @@ def test_epochs_hold_every_sample_once_and_differ() -> None:
 
 
 def test_groups_share_an_object_and_rounds_show_all() -> None:
-    config = PipelineConfig(batch_size=15, samples_per_object=12, crops_per_object=3, seed=1)
+    config = PipelineConfig(batch_size=15, samples_per_object=12, crops_per_object=3, random_seed=1)
     for number in range(8):
         objects = batches(config)[number].object.reshape(-1, 3)
         assert (objects == objects[:, :1]).all()
@@ -80,7 +79,7 @@ def test_groups_share_an_object_and_rounds_show_all() -> None:
 
 
 def test_order_of_samples_does_not_follow_their_drops() -> None:
-    config = PipelineConfig(batch_size=20, samples_per_object=20, seed=0)
+    config = PipelineConfig(batch_size=20, samples_per_object=20, random_seed=0)
     source = SampleBatches(config, 1, 20)
     orders = np.stack([source[epoch].drop for epoch in range(200)])
     assert (np.sort(orders, axis=1) == np.arange(20)).all()
@@ -127,20 +126,11 @@ def test_hosts_share_each_global_batch(hosts: int, ordered: bool) -> None:
             assert (np.diff(share[number].object.reshape(-1, 2), axis=1) == 0).all()
 
 
-def test_finite_epochs_drop_what_does_not_fill_a_batch() -> None:
-    for epochs, count in ((1, 6), (2, 13), (3, 20)):
-        config = PipelineConfig(batch_size=6, samples_per_object=8, crops_per_object=2, seed=3, epochs=epochs)
-        source = batches(config)
-        assert len(source) == count
-        assert len(list(BatchIterator(source))) == count
-        assert all(equal(source[number], batches()[number]) for number in range(count))
-        with pytest.raises(IndexError):
-            source[count]
-    assert len(batches()) == sys.maxsize
-
-
 def test_ordered_pass_is_finite_fixed_and_padded() -> None:
     source = batches(ordered=True)
+    assert (len(source), len(batches())) == (7, sys.maxsize)
+    with pytest.raises(IndexError):
+        source[7]
     parts = list(BatchIterator(source))
     assert [len(part.mask) for part in parts] == [6] * 7
     mask = np.concatenate([part.mask for part in parts])
@@ -151,7 +141,7 @@ def test_ordered_pass_is_finite_fixed_and_padded() -> None:
     assert len({key for _, _, key in real}) == EPOCH
     assert list(rows(parts))[EPOCH:] == real[-1:] * 2
     # Neither batches nor groups decide which samples a validation set has.
-    other = PipelineConfig(batch_size=40, samples_per_object=8, seed=3)
+    other = PipelineConfig(batch_size=40, samples_per_object=8, random_seed=3)
     assert list(rows([batches(other, ordered=True)[0]])) == real
 
 
@@ -192,26 +182,24 @@ def test_state_moves_between_numbers_of_hosts() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"seed": 4}, "saved with seed = 3, but now it is 4"),
+        ({"random_seed": 4}, "saved with random_seed = 3, but now it is 4"),
         ({"batch_size": 12}, "saved with batch_size = 6, but now it is 12"),
         ({"samples_per_object": 4}, "saved with samples_per_object = 8"),
     ],
 )
 def test_state_of_another_order_is_refused(change: dict[str, int], message: str) -> None:
-    values = {"batch_size": 6, "samples_per_object": 8, "crops_per_object": 2, "seed": 3}
+    values = {"batch_size": 6, "samples_per_object": 8, "crops_per_object": 2, "random_seed": 3}
     state = BatchIterator(batches()).get_state()
     with pytest.raises(InputError, match=message):
         BatchIterator(batches(PipelineConfig(**{**values, **change}))).set_state(state)
 
 
-def test_state_of_other_objects_is_refused_and_more_epochs_are_not() -> None:
+def test_state_of_other_objects_is_refused() -> None:
     iterator = BatchIterator(batches(), identity="a")
     with pytest.raises(InputError, match="saved with identity = b, but now it is a"):
         iterator.set_state(BatchIterator(batches(), identity="b").get_state())
     with pytest.raises(InputError, match="num_drops"):
         iterator.set_state(BatchIterator(SampleBatches(CONFIG, 5, [4, 4, 4, 4, 3]), identity="a").get_state())
-    longer = PipelineConfig(batch_size=6, samples_per_object=8, crops_per_object=2, seed=3, epochs=9)
-    BatchIterator(batches(longer), identity="a").set_state(iterator.get_state())
 
 
 @pytest.mark.parametrize(
@@ -237,10 +225,9 @@ def test_broken_state_is_refused(state: bytes) -> None:
     ("values", "message"),
     [
         ({"batch_size": 0}, "batch_size = 0 must be 1 or more"),
-        ({"epochs": 0}, "epochs = 0 must be 1 or more"),
         ({"batch_size": 14, "crops_per_object": 4}, "batch_size = 14 must be a multiple of crops_per_object = 4"),
         ({"batch_size": 9, "crops_per_object": 3}, "samples_per_object = 160 must be a multiple"),
-        ({"seed": -1}, "seed = -1"),
+        ({"random_seed": -1}, "random_seed = -1"),
     ],
 )
 def test_contradictory_configs_are_refused(values: dict[str, int], message: str) -> None:
@@ -257,16 +244,6 @@ def test_impossible_shares_are_refused() -> None:
         SampleBatches(CONFIG, 2, [3, 0])
     with pytest.raises(InputError, match="at least one object"):
         SampleBatches(CONFIG, 0, 1)
-    with pytest.raises(InputError, match="epochs = 1 of 40 samples do not fill a batch of 80"):
-        batches(PipelineConfig(batch_size=80, samples_per_object=8, epochs=1))
-    with pytest.raises(InputError, match="an ordered pass is one epoch"):
-        batches(PipelineConfig(batch_size=4, epochs=1), ordered=True)
-
-
-def test_grain_dataset_maps_batches() -> None:
-    dataset = index_dataset(batches(ordered=True), make=lambda index: index.mask.sum())
-    assert len(dataset) == 7
-    assert [int(count) for count in dataset] == [6] * 6 + [4]
 
 
 def test_import_does_not_load_grain() -> None:

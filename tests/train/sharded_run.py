@@ -14,7 +14,6 @@ from kmn_jax.train import (
     data_mesh,
     jit_train_step,
     put_batch,
-    put_number,
     put_whole,
     training_source,
 )
@@ -36,7 +35,7 @@ def losses(config: TrainConfig, devices: list[jax.Device]) -> dict[str, Any]:
     for number in range(STEPS):
         batch = put_batch(source.batches[number], mesh)
         rows = batch.object.addressable_shards[0].data.shape[0]
-        state, metrics = step(state, source.pack, batch, put_number(number, mesh))
+        state, metrics = step(state, source.pack, batch, put_whole(np.int32(number), mesh))
         found.append([float(value) for value in jax.device_get(metrics)])
         norms.append(squared_norm(state))
     return {"devices": mesh.size, "rows": rows, "metrics": found, "norms": norms}

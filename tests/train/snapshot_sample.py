@@ -44,7 +44,7 @@ def random_leaf(random: np.random.Generator, shape: tuple[int, ...], dtype: np.d
 
 def random_snapshot(step: int, like: TrainState | None = None) -> Snapshot:
     """Return a snapshot that depends on the step alone."""
-    iterator = BatchIterator(SampleBatches(PipelineConfig(batch_size=2, seed=step), 3, 4))
+    iterator = BatchIterator(SampleBatches(PipelineConfig(batch_size=2, random_seed=step), 3, 4))
     for _ in range(step % 3):
         next(iterator)
     facts = {"config": {"name": "tiny", "rate": 1e-4}, "losses": [0.1 + step, 1 / 3], "commit": None, "é": "ü"}

@@ -89,7 +89,7 @@ def test_odd_leaves(tmp_path: Path, like: TrainState) -> None:
 
 
 def test_keeps_the_latest_and_the_best(tmp_path: Path, like: TrainState) -> None:
-    checkpoints = Checkpoints(tmp_path, keep=2)
+    checkpoints = Checkpoints(tmp_path)
     for step in range(1, 7):
         checkpoints.save(random_snapshot(step, like), best=step in (1, 2))
     assert checkpoints.steps == [2, 5, 6]
@@ -99,12 +99,10 @@ def test_keeps_the_latest_and_the_best(tmp_path: Path, like: TrainState) -> None
     assert checkpoints.steps == [6, 7]
     assert_same(checkpoints.best(like), random_snapshot(7, like))
     assert len(list(tmp_path.iterdir())) == 2
-    with pytest.raises(InputError, match="keep = 0"):
-        Checkpoints(tmp_path, keep=0)
 
 
 def test_a_step_can_be_saved_again(tmp_path: Path, like: TrainState) -> None:
-    checkpoints = Checkpoints(tmp_path, keep=2)
+    checkpoints = Checkpoints(tmp_path)
     for step, loss, best in [(1, 0.5, False), (2, 0.4, False), (2, 0.3, True), (2, 0.2, False)]:
         checkpoints.save(replace(random_snapshot(step, like), facts={"loss": loss}), best)
     assert checkpoints.steps == [1, 2]
@@ -329,7 +327,7 @@ jax.distributed.initialize(f"localhost:{port}", 2, process)
 from kmn_jax.errors import InputError
 from kmn_jax.train._checkpoint import Checkpoints
 from kmn_jax.train._snapshot import unpack, pack
-from tests.train.snapshot_sample import TINY, abstract_state, random_snapshot
+from tests.train.snapshot_sample import abstract_state, random_snapshot
 mesh = Mesh(np.array(jax.devices()), ("data",))
 def sharding(leaf):
     split = leaf.ndim > 0 and leaf.shape[0] % 2 == 0
@@ -344,7 +342,9 @@ wanted = pack(random_snapshot(3, plain))
 checkpoints.save(unpack(wanted, like))
 found = checkpoints.latest(like)
 assert not found.state.parameters["scene"]["out"]["kernel"][...].is_fully_addressable
-assert pack(found).digest == wanted.digest
+again = pack(found)
+assert again.record == wanted.record
+assert all(again.arrays[name].tobytes() == array.tobytes() for name, array in wanted.arrays.items())
 for attempt in (lambda: checkpoints.latest(abstract_state(clip_norm=0.0)), lambda: checkpoints.save(found_earlier)):
     found_earlier = unpack(pack(random_snapshot(2, plain)), like)
     try:

@@ -39,18 +39,17 @@ def test_arguments_are_fields(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
         return Outcome(3, "SIGTERM came", None, 0)
 
     monkeypatch.setattr("experiments.train.train", stopped)
-    options = {"max_minutes": None, "resume": False, "import_from": None, "export_to": None}
+    options = {"max_minutes": None, "resume": False}
     for name, config in CONFIGS.items():
         assert main([name]) == 0
         assert seen.pop() == (config, Path("runs") / name, options)
-    more = ["--resume", "--export=a", "--import", "b", "--max-minutes", "5", "--folder", "a run"]
+    more = ["--resume", "--max-minutes", "5", "--folder", "a run"]
     capsys.readouterr()
-    assert main([*flags(seed=7), *more]) == 0
-    options = {"max_minutes": 5.0, "resume": True, "import_from": Path("b"), "export_to": Path("a")}
-    assert seen == [(tiny(seed=7), Path("a run"), options)]
+    assert main([*flags(random_seed=7), *more]) == 0
+    assert seen == [(tiny(random_seed=7), Path("a run"), {"max_minutes": 5.0, "resume": True})]
     output = capsys.readouterr().out
     assert output.startswith("stopped after step 3 of 6 because SIGTERM came; go on with: python -m experiments.train ")
-    assert output.endswith(" --seed 7 --max-minutes 5 --folder 'a run' --resume\n")  # not an import or export again
+    assert output.endswith(" --random-seed 7 --max-minutes 5 --folder 'a run' --resume\n")
 
 
 def test_names_are_listed_and_guessed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -69,14 +68,13 @@ def test_names_are_listed_and_guessed(capsys: pytest.CaptureFixture[str]) -> Non
     [
         ("--num-steps 0", "num_steps = 0 must be at least 1"),
         ("--num-steps many", "--num-steps: invalid literal"),
-        ("--seed -1", "seed = -1 must be from 0"),
+        ("--random-seed -1", "random_seed = -1 must be from 0"),
         ("--max-minutes -1", "max_minutes = -1.0 must not be negative"),
         ("--pack nowhere", "nowhere/manifest.json cannot be read (No such file or directory): name the folder of a"),
         ("--examples.crops.num-points 32", "examples.crops.num_points = 32 and network.num_scene_points = 64 must be"),
         ("--crops-at-once 3", "crops_at_once = 3 must divide pipeline.crops_per_object = 2, or be a multiple of it"),
         ("--crops-at-once 8", "a batch of 4, in groups of 2 crops of one object, cannot be shared by 1 devices that"),
         ("--pipeline.batch-size 3", "batch_size = 3 must be a multiple of crops_per_object = 2"),
-        ("--pipeline.epochs 2", "pipeline.epochs = 2, but num_steps says how long a run is: leave it"),
         ("--validation-samples 3", "validation_samples = 3 must be a multiple of pipeline.crops_per_object = 2"),
         ("--optimizer.warmup-steps 3", 'warmup_steps = 3 needs schedule "cosine": "step" has no warm-up'),
         ("--optimizer.schedule cosine --optimizer.warmup-steps 6", "must be fewer than the run's 6 steps"),
@@ -84,9 +82,7 @@ def test_names_are_listed_and_guessed(capsys: pytest.CaptureFixture[str]) -> Non
         ("--network.inputs row", "invalid choice 'row' for argument '--network.inputs'"),
         ("--processes 2", "coordinator = None, processes = 2 and process = None belong together: give all"),
         ("--coordinator a:1 --processes 2 --process 2", "process = 2 must be from 0 to below processes = 2"),
-        ("--import nowhere", "nowhere/manifest.json does not exist: give the folder of an exported run"),
         ("--folder file", "cannot read the folder of checkpoints"),
-        ("--export file", "cannot make the folder file: File exists"),
     ],
 )
 def test_values_that_contradict_or_do_not_exist(

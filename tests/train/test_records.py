@@ -3,20 +3,20 @@ from __future__ import annotations
 from pathlib import Path
 
 from kmn_jax.train import read_metrics
-from kmn_jax.train._records import MetricFiles
+from kmn_jax.train._records import add_metrics, begin_metrics
 
 
 def test_rows_are_kept_up_to_where_a_run_goes_on(tmp_path: Path) -> None:
     rows = [(split, step) for step in (2, 4, 6) for split in ("train", "validation")]
-    with MetricFiles(tmp_path, 0, 0) as files:
-        for split, step in rows:
-            files.write({"step": step, "split": split, "loss": 1 / 3})
+    begin_metrics(tmp_path, 0, 0)
+    for split, step in rows:
+        add_metrics(tmp_path, {"step": step, "split": split, "loss": 1 / 3})
     with (tmp_path / "metrics.jsonl").open("a") as file:
         file.write('{"step": 2, "spl')
     # The run was saved at step 4, before the validation there.
     for _ in range(2):
-        with MetricFiles(tmp_path, 4, 2) as files:
-            files.write({"step": 4, "split": "validation", "loss": 0.5})
+        begin_metrics(tmp_path, 4, 2)
+        add_metrics(tmp_path, {"step": 4, "split": "validation", "loss": 0.5})
         written = [(row["split"], row["step"], row["loss"]) for row in read_metrics(tmp_path)]
         assert written == [(*row, 1 / 3) for row in rows[:3]] + [("validation", 4, 0.5)]
         table = (tmp_path / "metrics.csv").read_text().splitlines()

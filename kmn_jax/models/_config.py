@@ -1,0 +1,86 @@
+"""Sizes and switches of the network, as they are saved with its parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from kmn_jax.errors import InputError
+from kmn_jax.models._layers import Compute
+from kmn_jax.models._pair_head import PairDropout
+
+Graph = Literal["dynamic", "static"]
+Normalization = Literal["metric", "released"]
+Inputs = Literal["raw", "invariant"]
+ObjectBranch = Literal["cad", "learned"]
+
+_CHOICES = {
+    "normalization": get_args(Normalization),
+    "inputs": get_args(Inputs),
+    "object_branch": get_args(ObjectBranch),
+    "graph": get_args(Graph),
+    "compute": get_args(Compute),
+    "pair_dropout": get_args(PairDropout),
+}
+
+
+@dataclass(frozen=True)
+class KeyMatchNetConfig:
+    """Sizes and switches of the network; the defaults are the published ones, but for the input scaling.
+
+    Attributes:
+        num_scene_points, num_object_points, num_keypoints: N, M and K, the sizes that data is made for. The
+            network itself takes any.
+        normalization: "metric" divides both clouds by one length, "released" is what the authors' weights need.
+        inputs: "raw" coordinates and normals as published, or rotation "invariant" point pair features.
+        graph: "dynamic" finds neighbours anew in feature space, "static" keeps those of the coordinates.
+        object_branch: where keypoint features come from: the "cad" cloud, or "learned", for one object that the
+            network is trained for, and its K fixed keypoints.
+        object_digest: SHA-256 of that object's CAD file; empty for networks of any object.
+        compute: arithmetic of the layers; statistics, distances and logits are float32 in all.
+        pair_dropout: one dropout mask for all keypoints of a point ("shared"), or "per_pair" as published.
+    """
+
+    num_scene_points: int = 2048
+    num_object_points: int = 2048
+    num_keypoints: int = 20
+    num_neighbors: int = 20
+    edge_width: int = 64
+    embedding_width: int = 1024
+    scene_width: int = 512
+    object_width: int = 128
+    pair_width: int = 256
+    groups: int = 32
+    dropout: float = 0.4
+    pair_dropout: PairDropout = "shared"
+    normalization: Normalization = "metric"
+    inputs: Inputs = "raw"
+    graph: Graph = "dynamic"
+    object_branch: ObjectBranch = "cad"
+    object_digest: str = ""
+    compute: Compute = "float32"
+
+    def __post_init__(self) -> None:
+        for name, choices in _CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise InputError(f"{name} is {getattr(self, name)!r}, but must be one of {', '.join(choices)}")
+        sizes = ("num_scene_points", "num_object_points", "num_keypoints", "num_neighbors", "groups")
+        widths = ("edge_width", "embedding_width", "scene_width", "object_width", "pair_width")
+        for name in (*sizes, *widths):
+            size = getattr(self, name)
+            if not isinstance(size, int) or size < 1:
+                raise InputError(f"{name} is {size!r}, but must be a whole number, at least 1")
+            if name in widths and size % self.groups:
+                raise InputError(f"{name} is {size}, but must be a multiple of groups = {self.groups}")
+        if not 0 <= self.dropout < 1:
+            raise InputError(f"dropout is {self.dropout}, but must be in [0, 1)")
+        if self.inputs == "invariant" and self.normalization == "released":
+            raise InputError(
+                'inputs "invariant" need normalization "metric": "released" scales the axes of space unevenly'
+            )
+        if self.object_digest and self.object_branch == "cad":
+            raise InputError("object_digest names the object of a network with learned features, which this is not")
+        if self.num_keypoints > self.num_object_points:
+            raise InputError(
+                f"{self.num_keypoints} keypoints cannot be drawn from {self.num_object_points} object points"
+            )
