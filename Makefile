@@ -48,7 +48,7 @@ lock: ## compile pyproject.toml into the two locks (LOCK=--upgrade for newer ver
 		--no-annotate --python-version 3.11 --python-platform windows - -o requirements-bench.lock
 
 clean: ## remove the environments and caches
-	rm -rf .venv .venv-lock .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
+	rm -rf .venv .venv-lock .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
 
 $(READY): requirements.lock pyproject.toml .ci/environment
 	PYTHON="$(PYTHON)" .ci/environment

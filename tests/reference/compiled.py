@@ -18,7 +18,7 @@ def kept_programs() -> str:
         lines = []
     kind = sorted({line for line in lines if line.startswith(("model name", "flags"))})
     name = hashlib.sha256("\n".join([platform.machine(), platform.processor(), *kind]).encode()).hexdigest()[:16]
-    folder = Path(__file__).parents[2] / ".pytest_cache" / f"compiled_{name}"
+    folder = Path(__file__).parents[2] / ".cache" / f"compiled_{name}"
     if sum(path.stat().st_size for path in folder.glob("*")) > _MOST_KEPT:
         shutil.rmtree(folder, ignore_errors=True)
     return str(folder)
