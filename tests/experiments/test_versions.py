@@ -147,11 +147,11 @@ def test_a_stage_gives_what_it_gave_when_its_version_was_raised(stage: str) -> N
     assert same, f"{stage} gives other results: raise its version in experiments/evaluation/versions.py, {AGAIN}"
 
 
-def recipe() -> dict[str, Any]:
+def recipe(**changed: Any) -> dict[str, Any]:
     model = load_pretrained()
     ours = {"ours": Ours("ours", model), "open3d": Ours("open3d", model, search=OverMatches())}
     methods = {**ours, "own": OwnNetworks("own", {}), **METHODS}
-    return json.loads(json.dumps(evaluate.recipe_of(find_config("demo"), methods), default=str))
+    return json.loads(json.dumps(evaluate.recipe_of(replace(find_config("demo"), **changed), methods), default=str))
 
 
 @pytest.mark.parametrize(
@@ -176,6 +176,12 @@ def test_a_raised_version_makes_the_poses_of_its_own_stage_stale(
     with pytest.raises(InputError) as refused:
         Export.open(tmp_path, recipe(), overwrite=False)
     assert f"(differing: {stale})" in str(refused.value)
+
+
+def test_other_cases_make_all_poses_stale(tmp_path: Path) -> None:
+    Export.open(tmp_path, recipe(), overwrite=False)
+    with pytest.raises(InputError, match=r"\(differing: config\)"):
+        Export.open(tmp_path, recipe(random_seed=1), overwrite=False)
 
 
 def test_source_that_moves_or_is_edited_makes_nothing_stale(monkeypatch: pytest.MonkeyPatch) -> None:
