@@ -49,7 +49,7 @@ lock: ## compile pyproject.toml into the two locks (LOCK=--upgrade for newer ver
 		--no-annotate --python-version 3.11 --python-platform windows - -o requirements-bench.lock
 
 clean: ## remove the environments and caches
-	rm -rf .venv .venv-lock .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist site
+	rm -rf .venv .venv-lock .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist site
 
 $(READY): requirements.lock pyproject.toml .ci/environment
 	PYTHON="$(PYTHON)" .ci/environment

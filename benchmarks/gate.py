@@ -22,6 +22,7 @@ import tyro
 from flax import nnx
 
 from benchmarks.network_cases import Case, dense_jax_forward, head_features, make_case, match, points_in_order
+from benchmarks.reference import dense_jax
 from benchmarks.stages import SEARCH, network_call, small_crop
 from benchmarks.timing import compile_for, time_in_turn
 from kmn_jax.detection import poses_at
@@ -29,7 +30,6 @@ from kmn_jax.errors import InputError
 from kmn_jax.geometry import k_nearest, neighbor_graph, squared_distances
 from kmn_jax.models import released_object, released_scene
 from kmn_jax.report import print_table, write_json
-from tests.reference import dense_jax
 
 BASELINE = Path(__file__).with_name("baseline.json")
 LEAST = 0.6  # of the baseline's ratio: below, something has become slower

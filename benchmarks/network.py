@@ -27,10 +27,10 @@ from benchmarks.network_cases import (
     match,
     torch_forward,
 )
+from benchmarks.reference import dense_jax
 from benchmarks.timing import Compiled, compile_for, time_in_turn
 from kmn_jax.models import Compute
 from kmn_jax.report import print_table, write_json
-from tests.reference import dense_jax
 
 
 def main(

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from benchmarks.reference import dense_jax
 from kmn_jax.geometry import space_filling_order
 from kmn_jax.models import (
     RELEASED_CONFIG,
@@ -24,7 +25,6 @@ from kmn_jax.models import (
     released_scene,
     save_released,
 )
-from tests.reference import dense_jax
 
 
 class Case(NamedTuple):
@@ -126,7 +126,7 @@ def torch_forward(case: Case) -> Callable[[], tuple[np.ndarray, np.ndarray]] | N
 
     import torch
 
-    from tests.reference.dense_torch import DenseKeyMatchNet
+    from benchmarks.reference.dense_torch import DenseKeyMatchNet
 
     device = "cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu"
     torch.set_num_threads(os.cpu_count() or 1)

@@ -27,7 +27,6 @@ from kmn_jax.data import (
     take_scene,
     visible_points,
 )
-from kmn_jax.geometry import estimate_normals, normals_within_radius, orient_to_camera
 from kmn_jax.report import print_table, write_json
 from kmn_jax.simulate import SplatConfig, VisiblePoints
 
@@ -58,13 +57,11 @@ def main(
     arrays = jax.tree.map(jnp.asarray, stacked.arrays)
     agreement = agreement_rows(arrays, SplatConfig(num_bin_surfels=8 * arrays.bin_bits.shape[-1]))
     print_table(f"Splatting against ray casting, {len(stacked.names)} objects, all of their bins", agreement)
-    normals = normal_rows(arrays)
-    print_table("Normals of a crop's points against those of the CAD surface, degrees", normals)
     stages = stage_rows(arrays, sizes, repeats)
     print_table(f"Stages of one crop, 20 copies of {arrays.points.shape[1]} surfels and a bin", stages)
     throughput = [row for size in sizes for batch in batches for row in throughput_rows(arrays, size, batch, repeats)]
     print_table("View and crop", throughput)
-    write_json(json, {"agreement": agreement, "normals": normals, "stages": stages, "throughput": throughput})
+    write_json(json, {"agreement": agreement, "stages": stages, "throughput": throughput})
 
 
 def agreement_rows(pack: DevicePack, config: SplatConfig) -> list[dict[str, Any]]:
@@ -101,43 +98,6 @@ def agreement_rows(pack: DevicePack, config: SplatConfig) -> list[dict[str, Any]
         }
         for (part, weight), (false, called, missed, visible) in sums.items()
     ]
-
-
-def normal_rows(pack: DevicePack, crops: int = 40) -> list[dict[str, Any]]:
-    """Compare ways to estimate the normals of a crop's first 512 points from more of them."""
-    ways: dict[str, Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]] = {
-        f"{k} neighbours of {n}": partial(_by_neighbours, k=k, n=n) for k, n in ((16, 512), (16, 2048))
-    }
-    ways |= {
-        f"within {r} of {n}": partial(_within, r=r, n=n)
-        for r, n in ((0.06, 2048), (0.04, 4096), (0.06, 4096), (0.08, 4096))
-    }
-    rows = []
-    for noise in (0.0, 0.0075):
-        config = CropConfig(num_points=4096, max_noise=noise, normals="surface")
-        make = jax.jit(partial(_crop_and_diameter, pack, config, None))
-        estimate = {name: jax.jit(way) for name, way in ways.items()}
-        angles: dict[str, list[np.ndarray]] = {name: [] for name in ways}
-        for key in jax.random.split(jax.random.key(0), crops):
-            crop, diameter = make(key)
-            for name, way in estimate.items():
-                found, valid = way(crop.points / diameter, crop.mask)
-                towards = orient_to_camera(crop.points[:512], found, -crop.seed)
-                cosine = np.asarray((towards * crop.normals[:512]).sum(axis=1))
-                angle = np.where(valid, np.degrees(np.arccos(np.clip(cosine, -1, 1))), 90)
-                angles[name].append(angle[np.asarray(crop.is_object[:512])])
-        for name, parts in angles.items():
-            angle = np.concatenate(parts)
-            rows.append(
-                {
-                    "noise, % of diameter at most": 100 * noise,
-                    "normals": name,
-                    "median": float(np.median(angle)),
-                    "mean": float(angle.mean()),
-                    "above 30 %": 100 * float((angle > 30).mean()),
-                }
-            )
-    return rows
 
 
 def stage_rows(pack: DevicePack, sizes: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
@@ -197,29 +157,13 @@ def throughput_rows(pack: DevicePack, size: int, batch: int, repeats: int) -> li
 
 
 def _crop(pack: DevicePack, config: CropConfig, splat: SplatConfig | None, key: jax.Array) -> LabelledCrop:
-    return _crop_and_diameter(pack, config, splat, key)[0]
-
-
-def _crop_and_diameter(
-    pack: DevicePack, config: CropConfig, splat: SplatConfig | None, key: jax.Array
-) -> tuple[LabelledCrop, jax.Array]:
     """Make one crop of a random object and drop."""
     object_key, drop_key, crop_key = jax.random.split(key, 3)
     item = jax.random.randint(object_key, (), 0, pack.area.shape[0])
     drop = jax.random.randint(drop_key, (), 0, jnp.asarray(pack.num_drops)[item])
     scene = take_scene(pack, item, drop)
     keypoints = scene.surfels.points[:NUM_KEYPOINTS]
-    visible = visible_points(scene, splat)
-    return draw_crop(crop_key, visible, keypoints, scene.T_camera_object, scene.diameter, config), scene.diameter
-
-
-def _by_neighbours(points: jax.Array, mask: jax.Array, k: int, n: int) -> tuple[jax.Array, jax.Array]:
-    normals, valid = estimate_normals(points[:n], k, mask[:n])
-    return normals[:512], valid[:512]
-
-
-def _within(points: jax.Array, mask: jax.Array, r: float, n: int) -> tuple[jax.Array, jax.Array]:
-    return normals_within_radius(points[:512], points[:n], r, mask[:n])
+    return draw_crop(crop_key, visible_points(scene, splat), keypoints, scene.T_camera_object, scene.diameter, config)
 
 
 if __name__ == "__main__":

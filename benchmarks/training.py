@@ -178,7 +178,7 @@ def torch_step(batch: int) -> Callable[[], None] | None:
     import torch
     from torch.nn.functional import cross_entropy
 
-    from tests.reference.dense_torch import DenseKeyMatchNet
+    from benchmarks.reference.dense_torch import DenseKeyMatchNet
 
     device = "cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu"
     torch.set_num_threads(os.cpu_count() or 1)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,15 +21,15 @@ import tyro
 
 from experiments.evaluation.cases import Method, ObjectImages, limited
 from experiments.evaluation.configs import CONFIGS, OWN_NETWORKS, EvaluateConfig, find_config
-from experiments.evaluation.digests import library_versions, our_code, rivals_code, shared_code
 from experiments.evaluation.methods import ONE_RANSAC, Ours, OwnNetworks
 from experiments.evaluation.predictions import Export, check_files, export
 from experiments.evaluation.refinement import SETTINGS
 from experiments.evaluation.report import Result, draw_pictures, write_report
-from experiments.evaluation.rivals import Kiss, OverMatches, PointPairs, missing
+from experiments.evaluation.rivals import OverMatches
 from experiments.evaluation.scores import cells_of
 from experiments.evaluation.sources import Report, bop_objects, cloud_objects
-from experiments.evaluation.tuned import RIVALS
+from experiments.evaluation.tuned import RIVALS, without_package
+from experiments.evaluation.versions import shared_versions, versions_of
 from experiments.test_sets import SPLIT, build_test_set
 from kmn_jax.bop import NAMES_FILE, dataset_digest
 from kmn_jax.data import Source
@@ -81,20 +81,13 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
     for method in methods.values():
         if isinstance(method, OwnNetworks):
             method.check([found.name for found in objects])
-    recipe = {
-        "config": {key: value for key, value in asdict(config).items() if key not in _ELSEWHERE},
-        "data": _data_digest(config),
-        "code": shared_code(),
-        "versions": library_versions(),
-        "methods": {key: _settings(method) for key, method in methods.items()},
-        "refinement": {key: str(value) for key, value in SETTINGS.items()},
-        "processor": processor(),
-    }
-    exported = Export.open(folder, recipe, options.overwrite)
-    for number, some in enumerate(_some_at_a_time(methods)):
-        if number > 0:
-            jax.clear_caches()
-        export(objects, some, config.noise, config.crops, config.seed, exported)
+    exported = Export.open(folder, recipe_of(config, methods), options.overwrite)
+    keys = list(methods)
+    for first in range(0, len(keys), _TOGETHER):
+        if first > 0:
+            jax.clear_caches()  # what many compile takes all memory maps that Linux allows a process
+        some = {key: methods[key] for key in keys[first : first + _TOGETHER]}
+        export(objects, some, config.noise, config.crops, config.random_seed, exported)
     for found, noise in ((found, noise) for found in objects for noise in config.noise):
         for problem in exported.truth(found.name, noise).problems:
             _note(problems, problem)
@@ -112,53 +105,33 @@ def compare(options: Options, model: Model, methods: Mapping[str, Method], skipp
     return write_report(folder, result, draw_pictures(result, objects, exported))
 
 
-def _some_at_a_time(methods: Mapping[str, Method]) -> Iterator[dict[str, Method]]:
-    """Yield a few after a few: what many compile takes all memory maps that Linux allows a process."""
-    keys = list(methods)
-    for first in range(0, len(keys), _TOGETHER):
-        yield {key: methods[key] for key in keys[first : first + _TOGETHER]}
-
-
-def _settings(method: Method) -> dict[str, Any]:
-    """Return all that decides a method's poses, but for what decides those of all methods."""
-    rivals = {"rivals' code": rivals_code()} if uses_rivals(method) else {}
-    ours = {"our code": our_code()} if isinstance(method, Ours | OwnNetworks) else {}
-    library = library_versions([method.library]) if isinstance(method, Kiss | PointPairs) else {}
-    return {**method.settings, **ours, **rivals, **library}
-
-
-def uses_rivals(method: Method) -> bool:
-    """Tell whether the code of rivals decides a method's poses."""
-    return method.search is not None if isinstance(method, Ours) else not isinstance(method, OwnNetworks)
+def recipe_of(config: EvaluateConfig, methods: Mapping[str, Method]) -> dict[str, Any]:
+    """Return all that decides poses: what decides those of one method alone is under its key in "methods"."""
+    return {
+        "config": {key: value for key, value in asdict(config).items() if key not in _ELSEWHERE},
+        "data": _data_digest(config),
+        "versions": shared_versions(),
+        "methods": {key: {**method.settings, "versions": versions_of(method)} for key, method in methods.items()},
+        "refinement": {key: str(value) for key, value in SETTINGS.items()},
+        "processor": processor(),
+    }
 
 
 def _methods(config: EvaluateConfig, model: Model, networks: Path | None) -> tuple[dict[str, Method], dict[str, str]]:
     """Return the methods that can run, and why others cannot."""
-    methods: dict[str, Method] = {}
-    skipped: dict[str, str] = {}
-    for name in config.methods:
-        reason = None
-        if name == "ours":
-            methods[name] = Ours("kmn_jax", model)
-        elif name == "ours_ransac":
-            methods[name] = Ours("kmn_jax, one RANSAC", model, ONE_RANSAC)
-        elif name == "ours_no_normals":
-            unchecked = replace(ONE_RANSAC, ransac=RansacConfig(use_normals=False))
-            methods[name] = Ours("kmn_jax, one RANSAC, no normal check", model, unchecked)
-        elif name == OWN_NETWORKS:
-            methods[name] = OwnNetworks("kmn_jax, trained for the object", _own_networks(networks))
-        elif name == "ours_open3d":
-            reason = missing("open3d")
-            if reason is None:
-                methods[name] = Ours("kmn_jax, Open3D RANSAC", model, ONE_RANSAC, search=OverMatches())
-        else:
-            module, make = RIVALS[name]
-            reason = missing(module)
-            if reason is None:
-                methods[name] = make()
-        if reason is not None:
-            skipped[name] = reason
-            print(f"skipped {name}: {reason}", file=sys.stderr)
+    unchecked = replace(ONE_RANSAC, ransac=RansacConfig(use_normals=False))
+    makers: dict[str, Callable[[], Method]] = {
+        "ours": lambda: Ours("kmn_jax", model),
+        "ours_ransac": lambda: Ours("kmn_jax, one RANSAC", model, ONE_RANSAC),
+        "ours_no_normals": lambda: Ours("kmn_jax, one RANSAC, no normal check", model, unchecked),
+        "ours_open3d": lambda: Ours("kmn_jax, Open3D RANSAC", model, ONE_RANSAC, search=OverMatches()),
+        OWN_NETWORKS: lambda: OwnNetworks("kmn_jax, trained for the object", _own_networks(networks)),
+        **{name: make for name, (_, make) in RIVALS.items()},
+    }
+    skipped = without_package(config.methods)
+    for name, reason in skipped.items():
+        print(f"skipped {name}: {reason}", file=sys.stderr)
+    methods = {name: makers[name]() for name in config.methods if name not in skipped}
     if not methods:
         raise InputError(f"none of the methods can run: {'; '.join(skipped.values())}")
     return methods, skipped

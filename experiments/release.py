@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import tyro
 
+from experiments.evaluation.plots import as_png, new_figure
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
 from kmn_jax.models import load_model
@@ -108,12 +109,8 @@ def _curve(rows: list[dict[str, Any]]) -> str:
 
 
 def _picture(rows: list[dict[str, Any]], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(1, 3, figsize=(13, 4), layout="constrained")
+    figure, canvas = new_figure((13, 4))
+    axes = figure.subplots(1, 3)
     names = {"loss": "loss", "segmentation_accuracy": "segmentation accuracy", "keypoint_accuracy": "keypoint accuracy"}
     for axis, (key, label) in zip(axes, names.items(), strict=True):
         for split, style in (("train", {"lw": 0.7, "alpha": 0.6}), ("validation", {"marker": "o", "ms": 3})):
@@ -122,8 +119,7 @@ def _picture(rows: list[dict[str, Any]], path: Path) -> None:
         axis.set(xscale="log", xlabel="samples", title=label)
         axis.grid(alpha=0.3)
     axes[0].legend()
-    figure.savefig(path, dpi=110, metadata={"Software": None})
-    pyplot.close(figure)
+    write_whole(path, as_png(canvas))
 
 
 def _card(

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from experiments.evaluation.plots import as_png, new_figure
 from kmn_jax.files import write_whole
 
 Row = Mapping[str, float]
@@ -18,10 +18,7 @@ def save_reliability(tables: Mapping[str, Sequence[Row]], path: Path | None) -> 
     """
     if path is None:
         return
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5, 5), layout="constrained")
+    figure, canvas = new_figure((5, 5))
     axis = figure.add_subplot()
     axis.plot([0, 1], [0, 1], color="grey", lw=1, ls="--", label="as often as said")
     most = max((row["poses"] for rows in tables.values() for row in rows), default=1)
@@ -32,7 +29,4 @@ def save_reliability(tables: Mapping[str, Sequence[Row]], path: Path | None) -> 
     axis.set(xlabel="probability", ylabel="share right", xlim=(0, 1), ylim=(0, 1.02), aspect="equal")
     axis.legend(loc="upper left")
     axis.grid(alpha=0.3)
-    content = io.BytesIO()
-    FigureCanvasAgg(figure)
-    figure.savefig(content, dpi=110, metadata={"Software": None})
-    write_whole(path, content.getvalue())
+    write_whole(path, as_png(canvas))

@@ -39,7 +39,7 @@ class ShowData:
     objects: int = 6  # at most so many, evenly spread
     drops: int = 4  # of each object
     keypoints: int = 20
-    seed: int = 0
+    random_seed: int = 0
     crops: CropConfig = field(default_factory=CropConfig)
 
     def __post_init__(self) -> None:
@@ -80,7 +80,7 @@ def _pack_figure(pack: Pack, name: str, show: ShowData) -> Any:
     item, stacked = pack.load(name, visibility=False), stack_pack(pack, [name])
     drops = _spread(list(range(len(item.drops))), show.drops)
     figure, axes = _figure(len(drops), 4, f"{name}: {item.split}, diameter {1000 * item.diameter:.1f} mm")
-    for row, drop, key in zip(axes, drops, jax.random.split(jax.random.key(show.seed), len(drops)), strict=True):
+    for row, drop, key in zip(axes, drops, jax.random.split(jax.random.key(show.random_seed), len(drops)), strict=True):
         scene = item.drops[drop].scene
         visible, crop = _drawn(stacked.arrays, jnp.int32(drop), key, show.keypoints, show.crops)
         seen = np.asarray(visible.mask)

@@ -13,8 +13,8 @@ from pathlib import Path
 from experiments.evaluate import Options, compare, released_or_own, run
 from experiments.evaluation.cases import Method
 from experiments.evaluation.methods import ONE_RANSAC, Ours
-from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kiss, OverMatches, PointPairs, missing
-from experiments.evaluation.tuned import RIVALS
+from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kiss, OverMatches, PointPairs
+from experiments.evaluation.tuned import RIVALS, without_package
 from kmn_jax.errors import InputError
 from kmn_jax.models import Model
 
@@ -67,14 +67,14 @@ def _of_voxel(name: str, voxel: float, smooth: bool) -> Fpfh | Kiss:
 def tune(options: Options) -> Path:
     """Compare all settings of the rivals that are among the config's methods; return the path of the report's page."""
     model = released_or_own(options.config.weights)
-    needed = {**{name: module for name, (module, _) in RIVALS.items()}, "ours_open3d": "open3d"}
-    names = [name for name in options.config.methods if name in needed]
-    skipped = {name: reason for name in names if (reason := missing(needed[name])) is not None}
+    there = (*RIVALS, "ours_open3d")
+    names = [name for name in options.config.methods if name in there]
+    skipped = without_package(names)
     methods = {key: method for name in names if name not in skipped for key, method in methods_of(name, model).items()}
     if "ours" in options.config.methods:  # beside them
         methods["ours"] = Ours("kmn_jax", model)
     if not methods:
-        there_are = f"none of them can run: {skipped}" if skipped else f"there are {', '.join(needed)}"
+        there_are = f"none of them can run: {skipped}" if skipped else f"there are {', '.join(there)}"
         raise InputError(f"no rival to tune among {', '.join(options.config.methods)}: {there_are}")
     folder = options.output or Path("outputs") / "tuning" / options.config.name
     return compare(replace(options, output=folder), model, methods, skipped)

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import atexit
 import importlib.util
 import os
-import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from tests.reference.compiled import kept_programs
+
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
-# What one worker, or a command that a test starts, has compiled is read by the others, which get this from here.
+# Compiling is most of what tests take: what a run, a worker or a command of a test has compiled is read by the next.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="kmn_jax_compiled_")
-    atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = kept_programs()
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
 
 import jax
 import pytest

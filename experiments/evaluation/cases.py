@@ -96,7 +96,7 @@ class Method(Protocol):
 
 
 def draw_cases(
-    found: ObjectImages, crops: int, noise: float, seed: int = 0, report: Callable[[str], None] | None = None
+    found: ObjectImages, crops: int, noise: float, random_seed: int = 0, report: Callable[[str], None] | None = None
 ) -> Iterator[Case]:
     """Yield so many crops of an object, evenly many of each scan, with Gaussian noise of a share of its longest side.
 
@@ -115,7 +115,7 @@ def draw_cases(
             if report is not None:
                 report(str(error))
             continue
-        generator = np.random.default_rng([seed, zlib.crc32(image.name.encode())])
+        generator = np.random.default_rng([random_seed, zlib.crc32(image.name.encode())])
         rows, copies = _seeds(image, found.model, count, generator)
         made = 0
         for draw, (place, copy) in enumerate(zip(rows.tolist(), copies.tolist(), strict=True)):
@@ -125,7 +125,7 @@ def draw_cases(
             points = image.points[np.concatenate([[place], np.flatnonzero(near)])]
             if len(points) < _LEAST_POINTS:
                 continue
-            deviation = np.random.default_rng([seed, draw, zlib.crc32(image.name.encode())])
+            deviation = np.random.default_rng([random_seed, draw, zlib.crc32(image.name.encode())])
             noisy = points + sigma * deviation.standard_normal(points.shape, dtype=np.float32)
             name = f"{image.name}/{draw}"
             made += 1

@@ -107,7 +107,7 @@ def _drawn(
     return {
         (place, noise, row): case
         for place, noise in sorted({(place, noise) for place, noise, _ in wanted})
-        for row, case in enumerate(draw_cases(objects[place], config.crops, noise, config.seed))
+        for row, case in enumerate(draw_cases(objects[place], config.crops, noise, config.random_seed))
         if (place, noise, row) in wanted
     }
 

@@ -65,14 +65,14 @@ class EvaluateConfig:
     noise: tuple[float, ...] = (0.0, 0.01, 0.05)  # share of the object's longest side
     methods: tuple[str, ...] = METHODS
     weights: str = "small"  # released network, or a .safetensors file
-    seed: int = 0
+    random_seed: int = 0
 
     def __post_init__(self) -> None:
         """Refuse what cannot be evaluated."""
         if self.crops < 1 or (self.images is not None and self.images < 1):
             raise InputError(f"crops = {self.crops} and images = {self.images} must be 1 or more")
-        if self.seed < 0:
-            raise InputError(f"seed is {self.seed}, but must be 0 or more")
+        if self.random_seed < 0:
+            raise InputError(f"random_seed is {self.random_seed}, but must be 0 or more")
         if not self.noise or not all(0 <= level < 1 for level in self.noise):
             raise InputError(f"noise is {self.noise}, but must be shares of the object's longest side, 0 to 1")
         if not self.methods:
@@ -106,7 +106,7 @@ _WRS = ("04_37D", "05_PTPA30", "11_PTPA42", "07_SBARB", "08_SSFHRT", "13_APTF40"
 _ALL = (
     EvaluateConfig("electronics", folder=_SETS / "electronics"),
     EvaluateConfig("industrial", folder=_SETS / "industrial"),
-    EvaluateConfig("validation", folder=Path("outputs/validation_bins/perfect"), crops=10, seed=7),
+    EvaluateConfig("validation", folder=Path("outputs/validation_bins/perfect"), crops=10, random_seed=7),
     EvaluateConfig(
         "per_object",
         folder=_SETS / "industrial",

@@ -1,7 +1,7 @@
 """Poses of methods on cases, exported once with what made them, and read as often as they are scored.
 
 One file for each method, object and noise, and one for the cases of an object and noise: an export goes on where it was
-stopped. What was made by another recipe (config, data, weights, code) is refused, not mixed in.
+stopped. What was made by another recipe (config, data, weights, versions) is refused, not mixed in.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Export:
 
     folder: Path
     recipe: Mapping[str, Any]
-    commit: str = "unknown"  # of the code that writes; not of the recipe, whose digest of the code is more exact
+    commit: str = "unknown"  # of the code that writes, for the record: versions say when poses have to be made anew
 
     @classmethod
     def open(cls, folder: Path, recipe: Mapping[str, Any], overwrite: bool) -> Export:
@@ -173,7 +173,7 @@ def export(
     methods: Mapping[str, Method],
     noises: Sequence[float],
     crops: int,
-    seed: int,
+    random_seed: int,
     folder: Export,
 ) -> None:
     """Run all methods on all cases, but those of which there are files. Shows its progress."""
@@ -188,7 +188,7 @@ def export(
             if not missing and known:
                 continue
             problems: list[str] = []
-            cases = list(draw_cases(found, crops, noise, seed, problems.append))
+            cases = list(draw_cases(found, crops, noise, random_seed, problems.append))
             folder.write_truth(found.name, noise, cases, problems)
             refine = Refinement(found.model)
             for key, method in missing.items():

@@ -152,7 +152,7 @@ def _facts(result: Result) -> dict[str, str]:
         "Machine": f"{environment['processor']}, {environment['cores']} cores, {environment['platform']}",
         "Versions": versions,
         "Weights": f"{result.config.weights}, digest of its parameters {result.weights[:16]}",
-        "Data": f"{result.config.name}, digest {str(result.recipe['data'])[:16]}, seed {result.config.seed}",
+        "Data": f"{result.config.name}, digest {str(result.recipe['data'])[:16]}, seed {result.config.random_seed}",
     }
 
 

@@ -235,11 +235,11 @@ class OverMatches:
         """All of them."""
         return {"library": "open3d", **asdict(self)}
 
-    def __call__(self, matches: Matches, diameter: float, seed: int) -> Float[np.ndarray, "4 4"] | None:
+    def __call__(self, matches: Matches, diameter: float, random_seed: int) -> Float[np.ndarray, "4 4"] | None:
         """Return the best pose; None if there are too few matches."""
         open3d = quiet_open3d()
         registration = open3d.pipelines.registration
-        open3d.utility.random.seed(seed % 2**31)
+        open3d.utility.random.seed(random_seed % 2**31)
         rows = np.flatnonzero(matches.mask)
         if len(rows) < 3:
             return None

@@ -130,11 +130,9 @@ def pair_errors(pairs: Float[np.ndarray, "p 2 4 4"], model: ObjectModel) -> Floa
 def recall_rows(cells: Sequence[Cell], objects: str) -> list[dict[str, Any]]:
     """Return a table's rows: for each method, the recall of all objects together at each noise, and times."""
     rows = []
-    for method in dict.fromkeys(cell.method for cell in cells):
-        own = [cell for cell in cells if cell.method == method]
+    for method, own in _by_method(cells).items():
         row: dict[str, Any] = {"method": method}
-        for noise in dict.fromkeys(cell.noise for cell in own):
-            whole = pooled([cell for cell in own if cell.noise == noise], objects)
+        for noise, whole in _by_noise(own, objects).items():
             row[noise_name(noise)] = cell_text(whole, "diameter")
             row[f"{noise_name(noise)}, by diagonal"] = f"{whole.recall('diagonal'):.2f}"
         everything = np.concatenate([cell.seconds for cell in own])
@@ -147,22 +145,32 @@ def recall_rows(cells: Sequence[Cell], objects: str) -> list[dict[str, Any]]:
 
 def seed_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
     """Return a table's rows: for each method, right poses of the very copies that the crops are around."""
-    rows = []
-    for method in dict.fromkeys(cell.method for cell in cells):
-        own = [cell for cell in cells if cell.method == method]
-        noises = dict.fromkeys(cell.noise for cell in own)
-        shares = {noise: pooled([cell for cell in own if cell.noise == noise], "").seed_recall() for noise in noises}
-        rows.append({"method": method, **{noise_name(noise): f"{share:.2f}" for noise, share in shares.items()}})
-    return rows
+    return [
+        {"method": method}
+        | {noise_name(noise): f"{whole.seed_recall():.2f}" for noise, whole in _by_noise(own, "").items()}
+        for method, own in _by_method(cells).items()
+    ]
 
 
 def object_rows(cells: Sequence[Cell], noise: float) -> list[dict[str, Any]]:
     """Return a table's rows: for each method, the recall of each object at one noise."""
-    rows = []
-    for method in dict.fromkeys(cell.method for cell in cells):
-        own = [cell for cell in cells if cell.method == method and cell.noise == noise]
-        rows.append({"method": method, **{cell.object: cell_text(cell, "diameter") for cell in own}})
-    return rows
+    return [
+        {"method": method} | {cell.object: cell_text(cell, "diameter") for cell in own if cell.noise == noise}
+        for method, own in _by_method(cells).items()
+    ]
+
+
+def _by_method(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
+    return {
+        method: [cell for cell in cells if cell.method == method]
+        for method in dict.fromkeys(cell.method for cell in cells)
+    }
+
+
+def _by_noise(cells: Sequence[Cell], name: str) -> dict[float, Cell]:
+    """Return the cells of one method, pooled over objects."""
+    noises = dict.fromkeys(cell.noise for cell in cells)
+    return {noise: pooled([cell for cell in cells if cell.noise == noise], name) for noise in noises}
 
 
 def cell_text(cell: Cell, gate: str) -> str:

@@ -7,10 +7,10 @@ Apart from `rivals`, so that a setting that changes makes the poses of its own m
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kiss, PointPairs
+from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kiss, PointPairs, missing
 
 # By the names of the methods: the package that is needed, and what makes the rival.
 RIVALS: Mapping[str, tuple[str, Callable[[], Any]]] = {
@@ -25,3 +25,10 @@ RIVALS: Mapping[str, tuple[str, Callable[[], Any]]] = {
     ),
     "kiss": ("kiss_matcher", lambda: Kiss(voxel=0.015, features=FeatureSettings(voxel=0.01, smooth=True))),
 }
+
+
+def without_package(names: Sequence[str]) -> dict[str, str]:
+    """Return why methods cannot run, of those whose package cannot be used."""
+    needed = {name: RIVALS[name][0] for name in names if name in RIVALS}
+    needed |= {name: "open3d" for name in names if name == "ours_open3d"}
+    return {name: reason for name, module in needed.items() if (reason := missing(module)) is not None}

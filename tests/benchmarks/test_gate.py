@@ -45,7 +45,10 @@ def test_the_committed_baseline_says_where_it_is_from() -> None:
 
 @jax.numpy_rank_promotion("allow")  # the dense reference is written plainly
 def test_both_sides_of_a_pair_compute_the_same() -> None:
-    case = make_case(1)
+    whole = make_case(1)
+    case = whole._replace(
+        crops=whole.crops[:, :512], clouds=whole.clouds[:, :512], keypoint_indices=whole.keypoint_indices % 512
+    )
     for pair in (gate.network_pair(case), gate.head_pair(case)):
         for ours, plain in zip(pair.ours(), pair.plain(), strict=True):
             plain = np.asarray(plain).reshape(np.shape(ours))

@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-import ast
-import importlib
 import importlib.metadata
 import json
 import re
 import shutil
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
 from experiments import ablate, evaluate, tune_rivals
-from experiments.evaluation import digests, predictions
+from experiments.evaluation import predictions, rivals
 from experiments.evaluation.cases import Case, ObjectImages, Solver, draw_cases
 from experiments.evaluation.configs import EvaluateConfig
-from experiments.evaluation.methods import Ours, OwnNetworks
-from experiments.evaluation.rivals import FastGlobal, Fpfh, Kiss, OverMatches, PointPairs, missing
+from experiments.evaluation.rivals import FastGlobal, Fpfh, Kiss, PointPairs, missing
 from experiments.evaluation.sources import bop_objects, cloud_objects
 from experiments.evaluation.tuned import RIVALS
+from experiments.evaluation.versions import VERSIONS, versions_of
 from kmn_jax.errors import InputError
 from kmn_jax.models import create_model, load_model, released_file, save_model
 from kmn_jax.objects import ObjectModel
@@ -121,10 +121,10 @@ def test_evaluating_twice_gives_the_same_numbers_and_a_report(
         assert "FPFH + RANSAC + ICP" in text
         assert "kiss: no_such_rival cannot be imported" in text
 
-    own, rivals = tmp_path / "one" / "ours" / f"{GEAR}.noise0.safetensors", tmp_path / "one" / "fpfh"
+    own = tmp_path / "one" / "ours" / f"{GEAR}.noise0.safetensors"
     stamp = own.stat().st_mtime_ns
     (before,) = json.loads((tmp_path / "one" / "scores.json").read_text())["poses"]
-    shutil.rmtree(rivals)
+    shutil.rmtree(tmp_path / "one" / "fpfh")
     monkeypatch.setattr(predictions, "commit", lambda: "a1b2c3")
     assert evaluate.main(["demo", *options, "--output", str(tmp_path / "one")]) == 0
     assert own.stat().st_mtime_ns == stamp  # not made anew
@@ -133,11 +133,9 @@ def test_evaluating_twice_gives_the_same_numbers_and_a_report(
     assert f"- Poses: made at commits {', '.join(made_at)}" in (tmp_path / "one" / "report.md").read_text()
     capsys.readouterr()
 
-    monkeypatch.setattr(evaluate, "rivals_code", lambda: "other code")
+    monkeypatch.setitem(VERSIONS, "Fpfh", 1 + VERSIONS["Fpfh"])
     assert evaluate.main(["demo", *options, "--output", str(tmp_path / "one")]) == 2
     assert "(differing: method fpfh)" in capsys.readouterr().err  # ours is not
-    assert evaluate.main(["demo", *options, "--seed", "1", "--output", str(tmp_path / "one")]) == 2
-    assert "differing: config" in capsys.readouterr().err
 
 
 def test_broken_scenes_are_reported_and_the_rest_is_read(tmp_path: Path) -> None:
@@ -195,80 +193,50 @@ def test_clouds_with_poses_are_evaluated_from_their_sensor(tmp_path: Path, gear:
         assert np.linalg.norm(found.model.points - local, axis=1).min() < 0.05 * found.model.diameter
 
 
-def test_the_code_of_rivals_makes_rivals_stale_alone() -> None:
-    used = evaluate.uses_rivals
-    model = load_model(released_file("small"))
-    assert not used(Ours("ours", model))
-    assert not used(OwnNetworks("own", {}))
-    assert used(Ours("Open3D's RANSAC", model, search=OverMatches()))
-    assert all(used(kind()) for kind in (Fpfh, FastGlobal, Kiss, PointPairs))
-    shared, ours, rivals = (
-        {path.name for path in digests.sources(names)} for names in (digests._SHARED, digests._OURS, digests._RIVALS)
-    )
-    assert {"cases.py", "icp.py", "scan_crop.py", "smoothing.py"} <= shared
-    assert {"methods.py", "ransac.py", "crop_pose.py", "encoder.py"} <= ours
-    assert rivals == {"rivals.py"}
-    with pytest.raises(FileNotFoundError, match="is not there"):
-        digests.sources(("experiments/evaluation/no_such_file.py",))
-
-
-def test_the_code_of_a_method_is_whole() -> None:
-    """What is imported by code that decides poses decides them as well, but for how inputs are checked and told."""
-    told = {f"kmn_jax.{name}" for name in ("checks", "files", "typing", "report")}
-    views = {"kmn_jax.detection._verify", "kmn_jax.detection._result"}  # a depth image of a cloud; what is pictured
-    shared = set(digests.sources(digests._SHARED))
-    for names in (digests._SHARED, digests._OURS, digests._RIVALS):
-        files = shared | set(digests.sources(names))
-        known = {".".join(file.relative_to(digests._ROOT).with_suffix("").parts) for file in files} | told | views
-        if names == digests._RIVALS:
-            known |= {"kmn_jax.pose._matches"}  # what is given
-        for file in digests.sources(names):
-            assert modules_of(file) <= known, f"{file}: {modules_of(file) - known}"
-
-
-def modules_of(file: Path) -> set[str]:
-    """Return the modules of ours that define what a file imports."""
-    found = set()
-    for node in ast.walk(ast.parse(file.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith(("kmn_jax", "experiments")):
-            module = importlib.import_module(node.module)
-            if not hasattr(module, "__path__"):
-                found.add(node.module)
-            found |= {getattr(getattr(module, name.name), "__module__", node.module) for name in node.names}
-    return {name for name in found if name.startswith(("kmn_jax", "experiments"))}
-
-
 def test_an_ablation_changes_one_choice_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    chosen = {"10 keypoints": ablate.VARIANTS["10 keypoints"], "256 points": ablate.VARIANTS["256 points"]}
-    monkeypatch.setattr(ablate, "VARIANTS", chosen)
-    monkeypatch.setattr(evaluate, "_TOGETHER", 2)  # of three
+    methods = ablate.methods_of(load_model(released_file("small")))
+    plain = leaves(methods["ours"].settings)
+    for key, method in methods.items():
+        assert len(plain.items() ^ leaves(method.settings).items()) == (0 if key == "ours" else 2), key
+    monkeypatch.setattr(ablate, "VARIANTS", {"10 keypoints": ablate.VARIANTS["10 keypoints"]})
+    monkeypatch.setattr(evaluate, "_TOGETHER", 1)  # of two
     options = ["demo", "--objects", GEAR, "--images", "1", "--crops", "3", "--output", str(tmp_path / "out")]
     assert ablate.main(options) == 0
     content = json.loads((tmp_path / "out" / "scores.json").read_text())
     assert {cell["method"] for cell in content["cells"]} == {
-        f"{name}{refined}" for name in ("kmn_jax", *chosen) for refined in ("", " + ICP")
+        f"{name}{refined}" for name in ("kmn_jax", "10 keypoints") for refined in ("", " + ICP")
     }
     settings = content["recipe"]["methods"]
-    assert "rivals' code" not in settings["ours"]
     assert settings["10_keypoints"]["num_keypoints"] == 10
     assert settings["ours"]["num_keypoints"] is None
 
 
+def leaves(settings: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Return settings without their nesting; one that is left out as a whole counts as one."""
+    found: dict[str, str] = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping) and key != "smooth":
+            found |= leaves(value, f"{prefix}{key}.")
+        else:
+            found[prefix + key] = str(value)
+    return found
+
+
 def test_rivals_are_tuned_by_settings_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tune_rivals, "_VOXELS", {"fpfh": ((0.05,), (0.05,)), "kiss": ((0.03,), (0.03,))})
+    monkeypatch.setattr(rivals, "_SMOOTHED", (1024, 2048))  # of which each is compiled
     options = ["demo", "--objects", GEAR, "--images", "1", "--crops", "2", "--output", str(tmp_path / "out")]
     assert tune_rivals.main(options) == 0
     recipe = json.loads((tmp_path / "out" / "scores.json").read_text())["recipe"]
     settings = recipe["methods"]
-    rivals = {f"{name}{how}" for name in ("fpfh_0.05", "kiss_0.03") for how in ("", "_smoothed")}
-    assert set(settings) == {*rivals, "ours"}
-    assert "rivals' code" not in settings["ours"]
+    tuned = {f"{name}{how}" for name in ("fpfh_0.05", "kiss_0.03") for how in ("", "_smoothed")}
+    assert set(settings) == {*tuned, "ours"}
     assert settings["fpfh_0.05_smoothed"]["features"]["smooth"]
     assert settings["fpfh_0.05"]["features"]["voxel"] == 0.05
-    assert settings["fpfh_0.05"]["rivals' code"] == digests.rivals_code()
+    assert settings["fpfh_0.05"]["versions"] == versions_of(Fpfh())
     # The version of a rival's library is a matter of this rival alone: it can be installed, or updated, later.
-    assert settings["kiss_0.03"]["kiss-matcher"] == importlib.metadata.version("kiss-matcher")
-    assert {*recipe["versions"]} == {"jax", "jaxlib", "numpy", "open3d"}
+    assert settings["kiss_0.03"]["versions"]["kiss-matcher"] == importlib.metadata.version("kiss-matcher")
+    assert {*recipe["versions"]} == {"cases", "refinement", "jax", "jaxlib", "numpy", "open3d"}
 
 
 def test_without_a_rival_there_is_nothing_to_tune(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -323,7 +291,7 @@ def test_networks_of_one_object_each_are_a_method(
         (["demo", "--output", str(SMALL / "out")], "which is evaluated: choose another --output"),
         (["demo", "--crops", "0"], "must be 1 or more"),
         (["demo", "--noise", "2"], "noise"),
-        (["demo", "--seed", "-1"], "seed is -1, but must be 0 or more"),
+        (["demo", "--random-seed", "-1"], "random_seed is -1, but must be 0 or more"),
         (["demo", "--weights", "none"], "none"),
     ],
 )

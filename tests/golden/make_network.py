@@ -48,7 +48,7 @@ def main() -> None:
     """Run the dense network and write the file."""
     import torch
 
-    from tests.reference.dense_torch import DenseKeyMatchNet
+    from benchmarks.reference.dense_torch import DenseKeyMatchNet
 
     network = DenseKeyMatchNet().eval().double()
     network.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in draw_state_dict(0).items()})

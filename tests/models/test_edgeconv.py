@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from benchmarks.reference import dense_jax
 from kmn_jax.models._edgeconv import EdgeConv
 from kmn_jax.models._layers import NormalizedLinear
 from tests.models.test_layers import signed_layer
-from tests.reference import dense_jax
 
 
 def signed_block(in_features: int, depth: int, pair_features: int = 0) -> EdgeConv:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from benchmarks.reference import dense_jax
 from kmn_jax.errors import InputError
 from kmn_jax.models import (
     KeyMatchNetConfig,
@@ -20,7 +21,6 @@ from kmn_jax.models import (
     released_object,
     released_scene,
 )
-from tests.reference import dense_jax
 from tests.reference.clouds import box_cloud, scene_crop
 
 SMALL = {

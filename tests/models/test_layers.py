@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from benchmarks.reference.dense_jax import group_norm
 from kmn_jax.models._layers import ChannelAffine, NormalizedLinear, channel_moments, dropout, leaky_relu, product
-from tests.reference.dense_jax import group_norm
 
 
 def signed_layer(in_features: int, out_features: int, groups: int, seed: int = 0) -> NormalizedLinear:

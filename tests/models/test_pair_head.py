@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from benchmarks.reference import dense_jax
 from kmn_jax.models._pair_head import (
     PairHead,
     kept_pairs,
@@ -14,7 +15,6 @@ from kmn_jax.models._pair_head import (
     pairwise_leaky_sum,
 )
 from tests.models.test_layers import signed_layer
-from tests.reference import dense_jax
 
 
 def signed_head(seed: int) -> PairHead:

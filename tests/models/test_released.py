@@ -193,7 +193,7 @@ def test_forward_agrees_with_the_dense_torch_network(seed: int, tmp_path: Path) 
     """Both outputs, published sizes, float32; then with the graphs given, so that no near-tie can flip."""
     import torch
 
-    from tests.reference.dense_torch import DenseKeyMatchNet, neighbours
+    from benchmarks.reference.dense_torch import DenseKeyMatchNet, neighbours
 
     network = DenseKeyMatchNet().draw(seed).eval()
     torch.save(network.state_dict(), tmp_path / "w.t7")
@@ -228,7 +228,7 @@ def test_forward_agrees_with_the_dense_torch_network(seed: int, tmp_path: Path) 
 def test_torch_reads_what_we_write(tmp_path: Path) -> None:
     import torch
 
-    from tests.reference.dense_torch import DenseKeyMatchNet
+    from benchmarks.reference.dense_torch import DenseKeyMatchNet
 
     model = create_model(RELEASED_CONFIG, jax.random.key(0))
     save_released(model, tmp_path / "ours.pt")

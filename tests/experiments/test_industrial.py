@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from experiments.write_industrial import PARTS, stl_bytes, triangle_mesh
 
-ASSETS = Path(__file__).parent.parent / "experiments" / "assets"
+ASSETS = Path(__file__).parents[2] / "experiments" / "assets"
 FOLDER = ASSETS / "industrial"
 # Holes that lead through each part: bores, windows, slots, and set-screw holes, which open into a bore.
 THROUGH_HOLES = {

@@ -64,7 +64,9 @@ class DenseKeyMatchNet(nn.Module):
                 parameter.data = torch.randn(parameter.shape, generator=generator) * (2 / fan_in) ** 0.5
         return self
 
-    def branch(self, prefix: str, cloud: torch.Tensor, keypoints: torch.Tensor | None, graphs: list | None):
+    def branch(
+        self, prefix: str, cloud: torch.Tensor, keypoints: torch.Tensor | None, graphs: list | None
+    ) -> torch.Tensor:
         def conv(index: int, x: torch.Tensor) -> torch.Tensor:
             return getattr(self, f"{prefix}{index}")(x)
 
@@ -81,12 +83,12 @@ class DenseKeyMatchNet(nn.Module):
         overall = conv(6, local).amax(-1, keepdim=True).expand(-1, -1, local.shape[-1])
         return conv(7, torch.cat([overall, local], dim=1))
 
-    def encode_object(self, cloud, keypoints, graphs=None) -> torch.Tensor:
+    def encode_object(self, cloud: torch.Tensor, keypoints: torch.Tensor, graphs: list | None = None) -> torch.Tensor:
         """(1, 6, m), (K,) -> (1, 128, K)."""
         x = self.obj_dp1(self.branch("conv_obj", cloud, keypoints, graphs))
         return self.obj_dp2(self.conv_obj8(x))
 
-    def encode_scene(self, cloud, graphs=None) -> torch.Tensor:
+    def encode_scene(self, cloud: torch.Tensor, graphs: list | None = None) -> torch.Tensor:
         """(1, 6, n) -> (1, 512, n)."""
         return self.branch("conv", cloud, None, graphs)
 
@@ -99,7 +101,14 @@ class DenseKeyMatchNet(nn.Module):
         x = self.dp2(self.conv8r(torch.cat([x.expand(-1, -1, -1, count), part], dim=1)))
         return self.conv9(x.amax(-1))[0].T, self.conv10(x)[0, 0]
 
-    def forward(self, scene_cloud, object_cloud, keypoints, scene_graphs=None, object_graphs=None):
+    def forward(
+        self,
+        scene_cloud: torch.Tensor,
+        object_cloud: torch.Tensor,
+        keypoints: torch.Tensor,
+        scene_graphs: list | None = None,
+        object_graphs: list | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Clouds (1, 6, n) and (1, 6, m), already normalised; returns segmentation (n, 2), keypoints (n, K)."""
         part = self.encode_object(object_cloud, keypoints, object_graphs)
         return self.match(self.encode_scene(scene_cloud, scene_graphs), part)

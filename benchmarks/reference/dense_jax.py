@@ -6,13 +6,17 @@ neighbour graphs. The reference that the separated form is held against, and its
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
+
 import jax
 import jax.numpy as jnp
 
+Parameters: TypeAlias = Mapping[str, Any]
 HIGHEST = jax.lax.Precision.HIGHEST
 
 
-def group_norm(z, scale, bias, groups=32):
+def group_norm(z: jax.Array, scale: jax.Array, bias: jax.Array, groups: int = 32) -> jax.Array:
     """Two-pass GroupNorm over all leading axes, in the plain (rows, groups, width) form."""
     rows = z.reshape(-1, groups, z.shape[-1] // groups)
     mean = rows.mean(axis=(0, 2), keepdims=True)
@@ -20,25 +24,31 @@ def group_norm(z, scale, bias, groups=32):
     return ((rows - mean) / jnp.sqrt(variance + 1e-5)).reshape(z.shape) * scale + bias
 
 
-def layer(x, parameters, groups=32):
+def layer(x: jax.Array, parameters: Parameters, groups: int = 32) -> jax.Array:
     z = jnp.matmul(x, parameters["kernel"], precision=HIGHEST)
     z = group_norm(z, parameters["norm_scale"], parameters["norm_bias"], groups)
     return jnp.where(z >= 0, z, 0.2 * z)
 
 
-def neighbours(features, k):
+def neighbours(features: jax.Array, k: int) -> jax.Array:
     squares = (features**2).sum(-1)
     product = jnp.matmul(features, features.T, precision=HIGHEST)
     return jax.lax.top_k(2 * product - squares[:, None] - squares[None, :], k)[1]
 
 
-def edges(features, graph):
+def edges(features: jax.Array, graph: jax.Array) -> jax.Array:
     neighbour = features[graph]
     centre = jnp.broadcast_to(features[: graph.shape[0], None], neighbour.shape)
     return jnp.concatenate([neighbour - centre, centre], axis=-1)
 
 
-def encode(cloud, parameters, k, keypoints=None, graphs=None):
+def encode(
+    cloud: jax.Array,
+    parameters: Parameters,
+    k: int,
+    keypoints: jax.Array | None = None,
+    graphs: Sequence[jax.Array] | None = None,
+) -> jax.Array:
     graph = neighbours(cloud[:, :3], k) if graphs is None else graphs[0]
     x1 = layer(layer(edges(cloud, graph), parameters["edge1"]["first"]), parameters["edge1"]["second"]).max(1)
     graph = neighbours(x1, k) if graphs is None else graphs[1]
@@ -57,15 +67,23 @@ def encode(cloud, parameters, k, keypoints=None, graphs=None):
     return layer(jnp.concatenate([overall, local], axis=1), parameters["out"])
 
 
-def encode_object(cloud, keypoints, parameters, k=20, graphs=None):
+def encode_object(
+    cloud: jax.Array,
+    keypoints: jax.Array,
+    parameters: Parameters,
+    k: int = 20,
+    graphs: Sequence[jax.Array] | None = None,
+) -> jax.Array:
     return layer(encode(cloud, parameters["object"], k, keypoints, graphs), parameters["object_out"])
 
 
-def encode_scene(cloud, parameters, k=20, graphs=None):
+def encode_scene(
+    cloud: jax.Array, parameters: Parameters, k: int = 20, graphs: Sequence[jax.Array] | None = None
+) -> jax.Array:
     return encode(cloud, parameters["scene"], k, None, graphs)
 
 
-def match(scene, part, parameters, groups=32):
+def match(scene: jax.Array, part: jax.Array, parameters: Parameters, groups: int = 32) -> tuple[jax.Array, jax.Array]:
     shape = (len(scene), len(part))
     part = jnp.broadcast_to(part[None], (*shape, part.shape[-1]))
     scene = jnp.broadcast_to(scene[:, None], (*shape, scene.shape[-1]))
