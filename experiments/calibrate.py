@@ -106,7 +106,7 @@ def _found_and_refined(
     kept = np.flatnonzero(choice.kept)
     if not len(kept):
         return [found]
-    return [found, refined_candidates(model, part, on_device, scene, found, kept, 0, config)]
+    return [found, refined_candidates(on_device, scene, found, kept, 0, config)]
 
 
 def fit(

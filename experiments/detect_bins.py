@@ -164,9 +164,7 @@ def _found(name: str, model: Model, fitted: Probabilities, image: BinImage) -> D
     rows = np.flatnonzero(choice.kept | choice.contenders)
     if len(rows):
         with clock("refinement"):
-            candidates = refined_candidates(
-                model, image.part, on_device, image.scene, candidates, rows, 0, CONFIG.search
-            )
+            candidates = refined_candidates(on_device, image.scene, candidates, rows, 0, CONFIG.search)
             choice = chosen(candidates, fitted.refined, on_device, CONFIG)
     poses = detections(candidates, choice, fitted.refined, image.part, image.scene)
     return Detections(image.part.name, image.scene.unit, poses, clock.timing, None, warnings)

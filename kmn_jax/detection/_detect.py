@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -20,7 +19,7 @@ from kmn_jax.detection._device_part import DevicePart, device_part, same_place
 from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
 from kmn_jax.detection._frames import placed
 from kmn_jax.detection._mapping import call_rows
-from kmn_jax.detection._refinement import main_turns, refine_many, refine_one
+from kmn_jax.detection._refinement import refine_many, refine_one
 from kmn_jax.detection._result import Detection, Detections
 from kmn_jax.detection._scene import Scene
 from kmn_jax.detection._search import Candidates, SearchConfig, crop_prediction, join, search_at, seed_keys
@@ -95,7 +94,7 @@ def detect(
         if choice.kept.any():
             with clock("refinement"):
                 rows = np.flatnonzero(choice.kept | choice.contenders)
-                found = refined_candidates(model, part, on_device, scene, found, rows, random_seed, search)
+                found = refined_candidates(on_device, scene, found, rows, random_seed, search)
             with clock("selection"):
                 choice = chosen(found, calibration, on_device, config)
     with clock("report"):
@@ -134,8 +133,6 @@ def explore(
 
 
 def refined_candidates(
-    model: Model,
-    part: Part,
     on_device: DevicePart,
     scene: Scene,
     found: Candidates,
@@ -147,17 +144,7 @@ def refined_candidates(
 
     The first k are the candidates themselves; all have evidence of their own.
     """
-    turns, is_rival = (jnp.asarray(array) for array in main_turns(part))
-    given = (
-        scene.cloud,
-        on_device.surfels,
-        turns,
-        is_rival,
-        on_device.arrays.diameter,
-        scene.image,
-        config.crops.smooth,
-        config.agreement,
-    )
+    given = (on_device, scene.cloud, scene.image, config.crops.smooth, config.agreement)
     seeds = found.seed_rows[found.crop[rows]]
     poses, there = call_rows(
         lambda pose, row, key: refine_one(pose, row, key, *given),

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from itertools import permutations, product
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from kmn_jax.detection._depth_agreement import DepthAgreementConfig, DepthImage, depth_agreement
-from kmn_jax.detection._device_part import symmetry_transforms
+from kmn_jax.detection._device_part import DevicePart
 from kmn_jax.detection._mapping import map_rows
 from kmn_jax.geometry import (
     Crop,
@@ -32,17 +30,13 @@ from kmn_jax.geometry import (
     transform_points,
     with_normals,
 )
-from kmn_jax.objects import Part
-from kmn_jax.pose import IcpConfig, icp, mssd
+from kmn_jax.pose import IcpConfig, icp
 from kmn_jax.simulate import Surfels
-from kmn_jax.typing import Points, Pose, PRNGKey, Scalar
+from kmn_jax.typing import Pose, PRNGKey, Scalar
 
 ALTERNATIVES = 2  # turned poses that are refined, too
 MARGIN = 0.1  # by which the depth image may speak against a turned pose before it is refined
 _ALIKE = 0.3  # cosine of normals, for a point that may lie on a pose's surface
-_SAME = 0.1  # diameters between points of turned and unturned parts that look the same
-_SIMILAR = 0.05  # diameters, in the mean, between the surfaces of parts that may be taken for each other
-_COMPARED = 256  # points
 _CROP_POINTS, _NORMALS = 2048, 768  # around the pose's seed, and of these with normals
 _NORMAL_RADIUS = 0.06  # diameters, of normals without smoothing
 _REACH = 0.1  # diameters, between points and the pose's surface
@@ -54,48 +48,10 @@ _RAW_TOLERANCE = 0.1  # diameters, of depths, for turns as they are: the pose is
 _TOLERANCE = 0.05  # the same, once they are roughly refined
 
 
-def main_turns(part: Part) -> tuple[Float32[np.ndarray, "v 4 4"], Bool[np.ndarray, " v"]]:
-    """Return the 23 turns that map the part's main axes onto each other, about the centroid of its surface.
-
-    These axes are those of its frame, or of its moments, whichever box along them is smaller.
-    The flags are false for those under which the part looks the same, or not at all like itself.
-    """
-    from scipy.spatial import cKDTree
-
-    points = part.points.astype(np.float64)
-    center = points.mean(axis=0)
-    moments = np.linalg.svd(points - center, full_matrices=False)[2]
-    axes = min((np.eye(3), moments), key=lambda axes: float(np.prod(np.ptp(points @ axes.T, axis=0))))
-    turns = []
-    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        turn = np.zeros((3, 3))
-        turn[range(3), order] = signs
-        if np.linalg.det(turn) > 0 and not np.array_equal(turn, np.eye(3)):
-            pose = np.eye(4)
-            pose[:3, :3] = axes.T @ turn @ axes
-            pose[:3, 3] = center - pose[:3, :3] @ center
-            turns.append(pose)
-    poses = np.array(turns, dtype=np.float32)
-    moved = _moved(
-        jnp.asarray(poses), jnp.asarray(part.points[:_COMPARED]), jnp.asarray(symmetry_transforms(part.symmetries))
-    )
-    surface, some = cKDTree(points), points[:_COMPARED]
-    apart = [surface.query(some @ pose[:3, :3].T + pose[:3, 3])[0].mean() for pose in turns]
-    return poses, (np.asarray(moved) > _SAME * part.diameter) & (np.array(apart) <= _SIMILAR * part.diameter)
-
-
-@jax.jit
-def _moved(poses: Float[Array, "v 4 4"], points: Points, symmetries: Float[Array, "t 4 4"]) -> Float[Array, " v"]:
-    return jax.lax.map(lambda pose: mssd(pose, jnp.eye(4), points, symmetries), poses)
-
-
 def refined_forms(
     pose: Pose,
     crop: Crop,
-    surfels: Surfels,
-    turns: Float[Array, "v 4 4"],
-    is_rival: Bool[Array, " v"],
-    diameter: Scalar,
+    part: DevicePart,
     image: DepthImage,
     smooth: SmoothConfig | None,
     agreement: DepthAgreementConfig,
@@ -105,6 +61,7 @@ def refined_forms(
 
     Poses are in the camera's frame. The first form is the pose itself.
     """
+    surfels, diameter = part.surfels, part.arrays.diameter
     many, few = (
         Surfels(surfels.points[:count], surfels.normals[:count], surfels.area)
         for count in (_OBJECT_POINTS, _ROUGH_SURFELS)
@@ -139,7 +96,7 @@ def refined_forms(
         return fine.T_scene_object
 
     unlikely = jnp.float32(-jnp.inf)
-    turned = map_rows(lambda turn: compose(pose, turn), turns)
+    turned = map_rows(lambda turn: compose(pose, turn), part.turns)
 
     def raw_score(turned: Pose, is_rival: Bool[Array, ""]) -> Scalar:
         return jax.lax.cond(is_rival, lambda: score(turned, _RAW_TOLERANCE), lambda: unlikely)
@@ -151,7 +108,7 @@ def refined_forms(
 
         return jax.lax.cond(is_rival, both, lambda: (start, unlikely))
 
-    hope, rows = jax.lax.top_k(map_rows(raw_score, turned, is_rival), _ROUGH_TURNS)
+    hope, rows = jax.lax.top_k(map_rows(raw_score, turned, part.is_rival), _ROUGH_TURNS)
     rough, scores = map_rows(roughly_refined, turned[rows], jnp.isfinite(hope))
     best, rows = jax.lax.top_k(scores, ALTERNATIVES)
     there = jnp.concatenate([jnp.ones(1, dtype=bool), best >= score(pose, _TOLERANCE) - margin])
@@ -166,18 +123,15 @@ def refine_one(
     pose: Pose,
     row: Int[Array, ""],
     key: PRNGKey,
+    part: DevicePart,
     cloud: PaddedCloud,
-    surfels: Surfels,
-    turns: Float[Array, "v 4 4"],
-    is_rival: Bool[Array, " v"],
-    diameter: Scalar,
     image: DepthImage,
     smooth: SmoothConfig | None,
     agreement: DepthAgreementConfig,
 ) -> tuple[Float[Array, "a 4 4"], Bool[Array, " a"]]:
     """Return the refined forms of a pose that was found around the point in a row of a cloud."""
-    crop = _crop(key, cloud, row, diameter, _CROP_POINTS, 1)
-    return _forms(pose, crop, surfels, turns, is_rival, diameter, image, smooth, agreement)
+    crop = _crop(key, cloud, row, part.arrays.diameter, _CROP_POINTS, 1)
+    return _forms(pose, crop, part, image, smooth, agreement)
 
 
 @partial(jax.jit, static_argnames=("smooth", "agreement"))
@@ -185,18 +139,18 @@ def refine_many(
     poses: Float[Array, "k 4 4"],
     rows: Int[Array, " k"],
     keys: Key[Array, " k"],
+    part: DevicePart,
     cloud: PaddedCloud,
-    surfels: Surfels,
-    turns: Float[Array, "v 4 4"],
-    is_rival: Bool[Array, " v"],
-    diameter: Scalar,
     image: DepthImage,
     smooth: SmoothConfig | None,
     agreement: DepthAgreementConfig,
 ) -> tuple[Float[Array, "k a 4 4"], Bool[Array, "k a"]]:
     """Return what `refine_one` does of many poses."""
-    given = (cloud, surfels, turns, is_rival, diameter, image, smooth, agreement)
-    return jax.vmap(lambda pose, row, key: refine_one(pose, row, key, *given))(poses, rows, keys)
+
+    def one(pose: Pose, row: Int[Array, ""], key: PRNGKey) -> tuple[Float[Array, "a 4 4"], Bool[Array, " a"]]:
+        return refine_one(pose, row, key, part, cloud, image, smooth, agreement)
+
+    return jax.vmap(one)(poses, rows, keys)
 
 
 _crop = partial(jax.jit, static_argnames=("num_points", "min_points"))(crop_around)

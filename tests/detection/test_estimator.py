@@ -108,15 +108,14 @@ def test_places_and_crops_give_the_pose_there(estimator: PoseEstimator, motor: P
     scan, truth = bin_of(0)
     whole = estimator.detect(motor, scan)
     seed = max(whole.poses, key=lambda pose: pose.probability).seed
-    there = estimator.detect(motor, scan, at=seed, top=1)
+    other = scan.points[np.linalg.norm(scan.points - seed, axis=1).argmax()]
+    scene = estimator.scene(scan, motor, at=np.stack([seed, other]))
+    there = estimator.detect(motor, scene, at=seed, top=1)
     assert errors(there.poses[0].T_scene_object, truth, motor).min() < 0.1
-    other = scan.points[len(scan.points) // 2]
-    both = estimator.detect(motor, scan, at=np.stack([seed, other]))
+    both = estimator.detect(motor, scene, at=np.stack([seed, other]))
     assert len(both.poses) <= 2
     poses = np.stack([pose.T_scene_object for pose in both.poses])
-    assert (poses == there.poses[0].T_scene_object).all(axis=(1, 2)).any(), (
-        "a place has its pose whatever else is asked"
-    )
+    assert (poses == there.poses[0].T_scene_object).all(axis=(1, 2)).any(), "whatever else is asked for"
 
 
 def test_several_parts_share_a_scene(estimator: PoseEstimator, motor: Part) -> None:

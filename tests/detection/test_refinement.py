@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.detection import DepthAgreementConfig, Scene, make_scene
-from kmn_jax.detection._refinement import main_turns, refined_forms
+from kmn_jax.detection import DepthAgreementConfig, DevicePart, Scene, make_scene, symmetry_transforms
+from kmn_jax.detection._device_part import main_turns
+from kmn_jax.detection._refinement import refined_forms
 from kmn_jax.geometry import Camera, SmoothConfig, crop_around, measured_points
 from kmn_jax.io import Scan
-from kmn_jax.objects import ObjectConfig, Part, object_from_mesh
+from kmn_jax.objects import ObjectConfig, Part, PartArrays, object_from_mesh
 from kmn_jax.objects._symmetry import rotation_about
 from kmn_jax.pose import mssd
 from kmn_jax.simulate import RayMesh, Surfels, render
@@ -45,6 +46,10 @@ def of_mesh(mesh: Mesh) -> Part:
     )
 
 
+def turns_of(part: Part) -> tuple[np.ndarray, np.ndarray]:
+    return main_turns(part, symmetry_transforms(part.symmetries))
+
+
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     depth = render(RayMesh(*notched_box()), camera_scene([TRUE], CAMERA)).depth.astype(np.float32)
@@ -53,7 +58,7 @@ def scene() -> Scene:
 
 
 def test_turns_are_rotations_about_the_centroid(part: Part) -> None:
-    turns, _ = main_turns(part)
+    turns, _ = turns_of(part)
     assert turns.shape == (23, 4, 4)
     np.testing.assert_allclose(np.linalg.det(turns[:, :3, :3]), 1, atol=1e-5)
     center = np.append(part.points.mean(axis=0), 1)
@@ -61,27 +66,29 @@ def test_turns_are_rotations_about_the_centroid(part: Part) -> None:
 
 
 def test_rivals_look_nearly_the_same_but_not_quite(part: Part) -> None:
-    turns, is_rival = main_turns(part)
+    turns, is_rival = turns_of(part)
     halves = (np.abs(np.diagonal(turns[:, :3, :3], axis1=1, axis2=2)) > 0.99).all(axis=1)
     assert halves.sum() == 3
     assert is_rival[halves].all()
     assert is_rival.sum() <= 4  # the box is too long for most others
-    assert not main_turns(of_mesh(bracket()))[1].any()
+    assert not turns_of(of_mesh(bracket()))[1].any()
     symmetries = np.stack([np.eye(3), *(rotation_about(axis, np.pi) for axis in np.eye(3))])
-    assert 23 - main_turns(box_part(2000, rotations=symmetries))[1].sum() >= 3
+    assert 23 - turns_of(box_part(2000, rotations=symmetries))[1].sum() >= 3
 
 
 def test_turned_poses_come_back(part: Part, scene: Scene) -> None:
-    turns, is_rival = main_turns(part)
+    turns, is_rival = turns_of(part)
     shift = np.eye(4, dtype=np.float32)
     shift[:3, 3] = 0.03
     starts = np.stack([TRUE @ shift, *(TRUE @ turn @ shift for turn in turns[is_rival])]).astype(np.float32)
     seed = jnp.int32(len(scene.points) // 2)
     surfels = Surfels(jnp.asarray(part.points), jnp.asarray(part.normals), jnp.float32(part.area))
     diameter = jnp.float32(part.diameter)
+    arrays = PartArrays(surfels.points, surfels.normals, jnp.zeros((8, 4)), diameter)
+    on_device = DevicePart(arrays, surfels, jnp.eye(4)[None], jnp.float32(0), jnp.asarray(turns), jnp.asarray(is_rival))
     crop = crop_around(jax.random.key(0), scene.cloud, seed, diameter, 2048, 1)
     forms = jax.jit(refined_forms, static_argnames=("smooth", "agreement", "margin"))
-    given = (crop, surfels, jnp.asarray(turns), jnp.asarray(is_rival), diameter, scene.image)
+    given = (crop, on_device, scene.image)
     settings = {"smooth": SmoothConfig(), "agreement": DepthAgreementConfig(), "margin": 2.0}
     results = [forms(jnp.asarray(start), *given, **settings) for start in starts]
     found, there = (np.stack(leaves) for leaves in zip(*results, strict=True))

@@ -47,7 +47,14 @@ def part(model: Model) -> DevicePart:
     features = encode_object(model, cloud[:64], np.arange(6), np.float32(2)).features
     points, normals = jnp.asarray(cloud[:64, :3]), jnp.asarray(cloud[:64, 3:])
     arrays = PartArrays(points, normals, features, jnp.float32(2))
-    return DevicePart(arrays, Surfels(points, normals, jnp.float32(10)), jnp.eye(4)[None], jnp.float32(0.2))
+    return DevicePart(
+        arrays,
+        Surfels(points, normals, jnp.float32(10)),
+        jnp.eye(4)[None],
+        jnp.float32(0.2),
+        jnp.eye(4)[None],
+        jnp.zeros(1, bool),
+    )
 
 
 @pytest.fixture(scope="module")

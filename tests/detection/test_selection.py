@@ -36,7 +36,8 @@ def on_device(part: Part) -> DevicePart:
     points, normals = jnp.asarray(part.points), jnp.asarray(part.normals)
     arrays = PartArrays(points, normals, jnp.zeros((8, 4)), jnp.float32(part.diameter))
     surfels = Surfels(points, normals, jnp.float32(part.area))
-    return DevicePart(arrays, surfels, jnp.asarray(symmetry_transforms(part.symmetries)), jnp.float32(same_place(part)))
+    symmetries, reach = jnp.asarray(symmetry_transforms(part.symmetries)), jnp.float32(same_place(part))
+    return DevicePart(arrays, surfels, symmetries, reach, jnp.eye(4)[None], jnp.zeros(1, bool))
 
 
 def chosen(

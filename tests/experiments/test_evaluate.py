@@ -198,7 +198,8 @@ def test_an_ablation_changes_one_choice_at_a_time(tmp_path: Path, monkeypatch: p
     plain = leaves(methods["ours"].settings)
     for key, method in methods.items():
         assert len(plain.items() ^ leaves(method.settings).items()) == (0 if key == "ours" else 2), key
-    monkeypatch.setattr(ablate, "VARIANTS", {"10 keypoints": ablate.VARIANTS["10 keypoints"]})
+    monkeypatch.setattr(ablate, "VARIANTS", {})
+    monkeypatch.setattr(ablate, "KEYPOINTS", {"10 keypoints": 10})
     monkeypatch.setattr(evaluate, "_TOGETHER", 1)  # of two
     options = ["demo", "--objects", GEAR, "--images", "1", "--crops", "3", "--output", str(tmp_path / "out")]
     assert ablate.main(options) == 0
@@ -215,7 +216,7 @@ def leaves(settings: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     """Return settings without their nesting; one that is left out as a whole counts as one."""
     found: dict[str, str] = {}
     for key, value in settings.items():
-        if isinstance(value, Mapping) and key != "smooth":
+        if isinstance(value, Mapping) and key not in ("smooth", "icp"):
             found |= leaves(value, f"{prefix}{key}.")
         else:
             found[prefix + key] = str(value)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kmn_jax.detection import CropPrediction, Detection, Detections, View
+from kmn_jax.detection import CropPrediction, Detection, Detections, Scene
 from kmn_jax.errors import InputError
 from kmn_jax.objects import Part, Symmetries
 from kmn_jax.viz import TRUTH_COLORS, distinct_colors, save_picture, truth_codes
@@ -28,12 +28,12 @@ def part() -> Part:
 
 
 @pytest.fixture(scope="module")
-def view() -> View:
+def view() -> Scene:
     return box_view()
 
 
 @pytest.fixture(scope="module")
-def found(part: Part, view: View) -> Detections:
+def found(part: Part, view: Scene) -> Detections:
     return both_boxes(part, view)
 
 
@@ -70,7 +70,7 @@ def with_faults(detection: Detection) -> Detection:
     return replace(detection, prediction=CropPrediction(points, on, keypoint))
 
 
-def test_the_picture_shows_every_pose_in_its_colour(part: Part, view: View, found: Detections, tmp_path: Path) -> None:
+def test_the_picture_shows_every_pose_in_its_colour(part: Part, view: Scene, found: Detections, tmp_path: Path) -> None:
     path = tmp_path / "result.png"
     save_picture(path, view, part, found)
     assert [file.name for file in tmp_path.iterdir()] == ["result.png"]
@@ -92,7 +92,7 @@ def test_the_picture_shows_every_pose_in_its_colour(part: Part, view: View, foun
 
 
 def test_keypoints_have_the_same_colours_on_the_scan_and_on_the_part(
-    part: Part, view: View, found: Detections, tmp_path: Path
+    part: Part, view: Scene, found: Detections, tmp_path: Path
 ) -> None:
     save_picture(tmp_path / "result.png", view, part, found)
     image = drawn(tmp_path / "result.png")
@@ -103,7 +103,7 @@ def test_keypoints_have_the_same_colours_on_the_scan_and_on_the_part(
         assert (shown > 100) == (index in front), f"keypoint {index}: {shown} pixels"
 
 
-def test_truth_is_coded_where_it_must_be(part: Part, view: View, found: Detections, tmp_path: Path) -> None:
+def test_truth_is_coded_where_it_must_be(part: Part, view: Scene, found: Detections, tmp_path: Path) -> None:
     faulty = replace(found, poses=(with_faults(found.poses[0]),))
     save_picture(tmp_path / "result.png", view, part, faulty, truth=POSES)
     image = drawn(tmp_path / "result.png")
@@ -123,7 +123,7 @@ def test_truth_is_coded_where_it_must_be(part: Part, view: View, found: Detectio
     assert yellow[:, 1].max() < blue[:, 1].min()
 
 
-def test_codes_of_a_turned_scene_and_of_copies_that_look_the_same(part: Part, view: View, found: Detections) -> None:
+def test_codes_of_a_turned_scene_and_of_copies_that_look_the_same(part: Part, view: Scene, found: Detections) -> None:
     T = pose((5.0, -2.0, 1.0), random_rotations(1, 3)[0])
 
     def moved(points: np.ndarray) -> np.ndarray:
@@ -152,7 +152,7 @@ def test_a_crop_that_is_on_no_copy_is_background(part: Part, found: Detections) 
     np.testing.assert_array_equal(truth_codes(part, found.poses[0], ()), codes)
 
 
-def test_no_pose_makes_a_picture_too(part: Part, view: View, found: Detections, tmp_path: Path) -> None:
+def test_no_pose_makes_a_picture_too(part: Part, view: Scene, found: Detections, tmp_path: Path) -> None:
     empty = replace(found, poses=(), reason="nothing in the scan looks like the $part")
     save_picture(tmp_path / "empty.png", view, part, empty)
     save_picture(tmp_path / "other.png", view, part, replace(empty, reason="the scan has too few points"))
@@ -166,7 +166,7 @@ def test_no_pose_makes_a_picture_too(part: Part, view: View, found: Detections, 
 
 
 def test_poses_may_be_outside_of_the_image_and_crops_empty(
-    part: Part, view: View, found: Detections, tmp_path: Path
+    part: Part, view: Scene, found: Detections, tmp_path: Path
 ) -> None:
     nothing = CropPrediction(np.zeros((0, 3), np.float32), np.zeros(0, bool), np.zeros(0, int))
     outside = [
@@ -180,7 +180,7 @@ def test_poses_may_be_outside_of_the_image_and_crops_empty(
         assert drawn(tmp_path / "outside.png").std() > 10
 
 
-def test_many_poses_take_little_time(part: Part, view: View, found: Detections, tmp_path: Path) -> None:
+def test_many_poses_take_little_time(part: Part, view: Scene, found: Detections, tmp_path: Path) -> None:
     many = replace(found, poses=found.poses * 10, warnings=("the scan has holes",))
     start = time.process_time()
     save_picture(tmp_path / "one.png", view, part, many)
@@ -188,7 +188,7 @@ def test_many_poses_take_little_time(part: Part, view: View, found: Detections, 
     assert drawn(tmp_path / "one.png").std() > 10
 
 
-def test_what_cannot_be_written_is_refused(part: Part, view: View, found: Detections, tmp_path: Path) -> None:
+def test_what_cannot_be_written_is_refused(part: Part, view: Scene, found: Detections, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="pictures are PNG files"):
         save_picture(tmp_path / "result.jpg", view, part, found)
     with pytest.raises(InputError, match="cannot write"):
@@ -210,7 +210,7 @@ def test_distances_from_the_surface_are_those_of_the_box(part: Part) -> None:
     assert found[~near].min() > 0.04 * part.diameter
 
 
-def test_units_of_part_and_scene_may_differ(part: Part, view: View, found: Detections, tmp_path: Path) -> None:
+def test_units_of_part_and_scene_may_differ(part: Part, view: Scene, found: Detections, tmp_path: Path) -> None:
     save_picture(tmp_path / "one.png", view, part, found, truth=POSES)
     save_picture(tmp_path / "other.png", view, part.in_unit("mm"), found, truth=POSES)
     one, other = drawn(tmp_path / "one.png"), drawn(tmp_path / "other.png")

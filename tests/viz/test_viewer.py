@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kmn_jax.detection import Detections, View
+from kmn_jax.detection import Detections, Scene
 from kmn_jax.detection._result import Timing
 from kmn_jax.errors import InputError
 from kmn_jax.viz import Viewer, distinct_colors
@@ -23,26 +23,26 @@ from kmn_jax.viz._viewer_scene import nearest_to_ray
 from tests.detection.box_sample import FRONT, POSES, SIZES, both_boxes, box_part, box_view, detection
 from tests.reference.meshes import pose, random_rotations
 
-T_SCENE_VIEW = pose((5.0, -2.0, 1.0), random_rotations(1, 3)[0])
+T_SCENE_CAMERA = pose((5.0, -2.0, 1.0), random_rotations(1, 3)[0])
 PART = box_part()
 
 
-def moved(view: View, found: Detections) -> tuple[View, Detections]:
+def moved(view: Scene, found: Detections) -> tuple[Scene, Detections]:
     """Return the sample in a scene whose frame is not the sensor's."""
 
     def into_scene(points: np.ndarray) -> np.ndarray:
-        return points @ T_SCENE_VIEW[:3, :3].T + T_SCENE_VIEW[:3, 3]
+        return points @ T_SCENE_CAMERA[:3, :3].T + T_SCENE_CAMERA[:3, 3]
 
     poses = [
         replace(
             one,
-            T_scene_object=T_SCENE_VIEW @ one.T_scene_object,
+            T_scene_object=T_SCENE_CAMERA @ one.T_scene_object,
             seed=into_scene(one.seed),
             prediction=replace(one.prediction, points=into_scene(one.prediction.points).astype(np.float32)),
         )
         for one in found.poses
     ]
-    return replace(view, T_scene_view=T_SCENE_VIEW), replace(found, poses=tuple(poses))
+    return replace(view, T_scene_camera=T_SCENE_CAMERA), replace(found, poses=tuple(poses))
 
 
 @dataclass
@@ -62,7 +62,7 @@ class Picker:
 
 
 @pytest.fixture(scope="module")
-def sample() -> tuple[View, Detections]:
+def sample() -> tuple[Scene, Detections]:
     view = box_view()
     return moved(view, both_boxes(PART, view))
 
@@ -146,7 +146,7 @@ def count_like(browser: Any, color: np.ndarray) -> int:
     return int((vivid & (cosine > 0.985)).sum())
 
 
-def test_the_page_shows_the_poses_and_switches_them(browser: Any, sample: tuple[View, Detections]) -> None:
+def test_the_page_shows_the_poses_and_switches_them(browser: Any, sample: tuple[Scene, Detections]) -> None:
     view, found = sample
     blue, _ = distinct_colors(2)
     with Viewer(view, PART, found, port=0) as page:
@@ -187,7 +187,7 @@ def test_the_page_shows_the_poses_and_switches_them(browser: Any, sample: tuple[
         eventually(lambda: page.is_shown(1, "Segmentation"))
 
 
-def test_a_click_on_the_scan_searches_there(browser: Any, sample: tuple[View, Detections], picked: Detections) -> None:
+def test_a_click_on_the_scan_searches_there(browser: Any, sample: tuple[Scene, Detections], picked: Detections) -> None:
     view, found = sample
     search = Picker(picked)
     with Viewer(view, PART, found, port=0, on_pick=search) as page:
@@ -201,7 +201,7 @@ def test_a_click_on_the_scan_searches_there(browser: Any, sample: tuple[View, De
         eventually(lambda: search.places)
         eventually(lambda: "Searching around" in text(browser))
         (place,) = search.places
-        in_view = (place - T_SCENE_VIEW[:3, 3]) @ T_SCENE_VIEW[:3, :3]
+        in_view = (place - T_SCENE_CAMERA[:3, 3]) @ T_SCENE_CAMERA[:3, :3]
         assert np.linalg.norm(view.points - in_view, axis=1).min() < 1e-5
         on_right_box = np.abs(in_view - POSES[1][:3, 3]) < np.array(SIZES) / 2 + 0.01
         assert on_right_box.all(), in_view
@@ -216,7 +216,7 @@ def test_a_click_on_the_scan_searches_there(browser: Any, sample: tuple[View, De
 
 
 def test_a_failed_search_is_a_message_and_the_page_lives_on(
-    browser: Any, sample: tuple[View, Detections], picked: Detections, capsys: pytest.CaptureFixture
+    browser: Any, sample: tuple[Scene, Detections], picked: Detections, capsys: pytest.CaptureFixture
 ) -> None:
     view, found = sample
     search = Picker(InputError("this place holds 3 points: pick another one"))
@@ -255,7 +255,7 @@ def test_a_failed_search_is_a_message_and_the_page_lives_on(
     assert "RuntimeError: broken" in capsys.readouterr().err  # what we did wrong is in the server's log
 
 
-def test_what_is_shown_may_change_and_be_nothing(sample: tuple[View, Detections], picked: Detections) -> None:
+def test_what_is_shown_may_change_and_be_nothing(sample: tuple[Scene, Detections], picked: Detections) -> None:
     view, found = sample
     with Viewer(view, PART, found, port=0) as page:
         page.show(picked)
@@ -268,7 +268,7 @@ def test_what_is_shown_may_change_and_be_nothing(sample: tuple[View, Detections]
         assert page.is_shown(2, "Surfaces")
 
 
-def test_a_port_in_use_is_refused_and_a_stopped_page_frees_it(sample: tuple[View, Detections]) -> None:
+def test_a_port_in_use_is_refused_and_a_stopped_page_frees_it(sample: tuple[Scene, Detections]) -> None:
     view, found = sample
     threads = set(threading.enumerate())
     page = Viewer(view, PART, found, port=0)
@@ -294,7 +294,7 @@ def test_a_port_in_use_is_refused_and_a_stopped_page_frees_it(sample: tuple[View
     ],
 )
 def test_places_that_are_not_ours_are_refused(
-    sample: tuple[View, Detections], place: dict[str, Any], message: str
+    sample: tuple[Scene, Detections], place: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
         Viewer(sample[0], PART, sample[1], **({"port": 0} | place))

@@ -1,0 +1,110 @@
+"""How two evaluations of the same crops differ: `python -m experiments.compare_runs BEFORE AFTER --dataset FOLDER`.
+
+Both are folders that `experiments.evaluate` wrote, such as of two states of the code. Recall is compared crop by crop;
+intervals come from drawing whole scans again, as crops of one scan are not independent.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+
+from experiments.evaluation.predictions import Export
+from experiments.evaluation.scores import THRESHOLD, cells_of
+from experiments.evaluation.sources import bop_objects
+from kmn_jax.errors import InputError
+from kmn_jax.report import print_table, write_json
+
+_DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to compare."""
+
+    before: Annotated[Path, tyro.conf.Positional]
+    after: Annotated[Path, tyro.conf.Positional]
+    dataset: Path  # in BOP format, of the objects of both
+    methods: tuple[str, ...] = ("ours",)  # that both have
+    noises: tuple[float, ...] = (0.0, 0.01, 0.05)
+    split: str = "test"
+    json: Path | None = None
+
+
+def compare(options: Options) -> list[dict[str, Any]]:
+    """Return a row for each method and noise. Raises InputError if the crops of both are not the same."""
+    models = {found.name: found.model for found in bop_objects(options.dataset, options.split, print)}
+    titles = {name: name for name in options.methods}
+    folders = [_opened(folder) for folder in (options.before, options.after)]
+    before, after = (cells_of(folder, models, titles, options.noises) for folder in folders)
+    scans = {(name, noise): _scans_of(folders, name, noise) for name in models for noise in options.noises}
+    rows = []
+    for method in dict.fromkeys(cell.method for cell in before):
+        for noise in options.noises:
+            pairs = [
+                (one.errors < THRESHOLD, other.errors < THRESHOLD, scans[one.object, noise])
+                for one, other in zip(before, after, strict=True)
+                if (one.method, one.noise) == (method, noise)
+            ]
+            right, now, scan = (np.concatenate(columns) for columns in zip(*pairs, strict=True))
+            low, high = _interval(now.astype(float) - right, scan)
+            rows.append(
+                {
+                    "method": method,
+                    "noise": noise,
+                    "crops": len(right),
+                    "recall before": float(right.mean()),
+                    "recall after": float(now.mean()),
+                    "difference": float(now.mean() - right.mean()),
+                    "95% interval": f"{low:+.3f} to {high:+.3f}",
+                }
+            )
+    return rows
+
+
+def _opened(folder: Path) -> Export:
+    try:
+        return Export(folder, json.loads((folder / "recipe.json").read_text(encoding="utf-8")))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{folder} is no folder of an evaluation ({error}): name one that evaluate wrote") from None
+
+
+def _scans_of(folders: list[Export], name: str, noise: float) -> np.ndarray:
+    """Return the scan of each crop, by its name."""
+    names, others = (folder.truth(name, noise).names for folder in folders)
+    if names != others:
+        raise InputError(f"the crops of {name} at noise {noise:g} are not the same: evaluate the same dataset twice")
+    return np.array([f"{name}/{crop.rsplit('/', 1)[0]}" for crop in names])
+
+
+def _interval(difference: Float[np.ndarray, " c"], scan: np.ndarray) -> tuple[float, float]:
+    """Return the middle 95% of the mean difference over scans drawn again."""
+    _, which = np.unique(scan, return_inverse=True)
+    counts, sums = np.bincount(which), np.bincount(which, difference)
+    rows = np.random.default_rng(0).integers(0, len(counts), (_DRAWS, len(counts)))
+    low, high = np.percentile(sums[rows].sum(axis=1) / counts[rows].sum(axis=1), [2.5, 97.5])
+    return float(low), float(high)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Compare: 0 is success, 2 bad input, in one sentence on stderr."""
+    options = tyro.cli(Options, args=arguments, description=__doc__)
+    try:
+        rows = compare(options)
+    except InputError as problem:
+        print(f"error: {problem}", file=sys.stderr)
+        return 2
+    print_table("Recall of the same crops", rows)
+    write_json(options.json, {"rows": rows})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
