@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from benchmarks.network_cases import each
+from benchmarks.network_cases import map_crops
 from benchmarks.stages import SEARCH, small_crop
 from benchmarks.timing import compile_for, time_in_turn
 from experiments.bins import LEAST_VISIBLE, THRESHOLD, BinImage, bin_images
@@ -146,7 +146,7 @@ def crop_row(batch: int, repeats: int) -> dict[str, Any]:
             crop = search_crop(cloud, 0, part.diameter, key, config)
             return poses_in_crop(model.graphdef, parameters, part, crop, key, config).poses
 
-        return each(one, (clouds, keys))
+        return map_crops(one, (clouds, keys))
 
     ready = compile_for(solve, model.parameters, part, clouds, keys)
     call = partial(ready.function, model.parameters, part, clouds, keys)

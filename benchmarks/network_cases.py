@@ -67,7 +67,7 @@ def make_case(batch: int) -> Case:
     return Case(nnx.from_flat_state(flat), clouds[0], clouds[1], indices, jnp.float32(1))
 
 
-def each(function: Callable[[Any], Any], batch: Any) -> Any:
+def map_crops(function: Callable[[Any], Any], batch: Any) -> Any:
     """Batch by vmap; on CPUs one after the other, as one crop fills the cores and many only outgrow the caches."""
     return jax.lax.map(function, batch) if jax.default_backend() == "cpu" else jax.vmap(function)(batch)
 
@@ -75,7 +75,7 @@ def each(function: Callable[[Any], Any], batch: Any) -> Any:
 def encode_objects(graphdef: nnx.GraphDef, parameters: nnx.State, case: Case) -> jax.Array:
     """Return the keypoints' features of a case's objects (b, 20, 128)."""
     network = nnx.merge(graphdef, parameters)
-    return each(lambda cloud: network.encode_object(cloud, case.keypoint_indices, case.length), case.clouds)
+    return map_crops(lambda cloud: network.encode_object(cloud, case.keypoint_indices, case.length), case.clouds)
 
 
 def cached_forward(graphdef: nnx.GraphDef, parameters: nnx.State, crops: jax.Array, parts: jax.Array) -> Any:
@@ -85,7 +85,7 @@ def cached_forward(graphdef: nnx.GraphDef, parameters: nnx.State, crops: jax.Arr
     def one(pair: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         return network.match(network.encode_scene(pair[0], jnp.float32(1)), pair[1])
 
-    return each(one, (crops, parts))
+    return map_crops(one, (crops, parts))
 
 
 def head_features(keypoints: int = 20) -> tuple[jax.Array, jax.Array]:

@@ -27,13 +27,15 @@ class Plane:
         return points.astype(np.float64) @ self.normal - self.offset
 
 
-def dominant_plane(points: Float[np.ndarray, "n 3"], margin: float, seed: int = 0, local: bool = False) -> Plane | None:
+def dominant_plane(
+    points: Float[np.ndarray, "n 3"], margin: float, random_seed: int = 0, local: bool = False
+) -> Plane | None:
     """Return the plane with the most points nearer to it than `margin`, refined by all of those; None if there is none.
 
-    Planes through three random points are compared, so that the same seed gives the same plane. Those of `local`
+    Planes through three random points are compared, so that the same `random_seed` gives the same plane. Those of `local`
     triples lie near to each other, which finds planes that hold few of the points.
     """
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(random_seed)
     if len(points) < 3:
         return None
     center = points.astype(np.float64).mean(axis=0)

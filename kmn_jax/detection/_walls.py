@@ -34,7 +34,7 @@ def off_walls(
     floor_is_known: bool,
     margin: float,
     least_extent: float,
-    seed: int = 0,
+    random_seed: int = 0,
 ) -> Bool[np.ndarray, " n"]:
     """Return which points, in the sensor's frame, are neither of a bin's walls nor outside of them; all without walls.
 
@@ -43,9 +43,9 @@ def off_walls(
     `margin` are its own. If the floor is not known, what lies deepest between two walls is left out, too: in a full bin
     too little of it is seen to be found as a large plane. Something always stays.
     """
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(random_seed)
     sample = points if len(points) <= _SAMPLE else points[generator.integers(0, len(points), _SAMPLE)]
-    borders = _walls(sample, ground, margin, least_extent, seed)
+    borders = _walls(sample, ground, margin, least_extent, random_seed)
     if not floor_is_known:
         inside = _inside(sample, borders, margin)
         hidden = _floor_between(sample[inside], borders, margin)
@@ -54,14 +54,14 @@ def off_walls(
 
 
 def _walls(
-    points: Float32[np.ndarray, "n 3"], ground: Ground | None, margin: float, least_extent: float, seed: int
+    points: Float32[np.ndarray, "n 3"], ground: Ground | None, margin: float, least_extent: float, random_seed: int
 ) -> list[Plane]:
     """Return walls, whose normals point out of the bin."""
     walls: list[Plane] = []
     kept: Bool[np.ndarray, " n"] = np.ones(len(points), dtype=bool)
     open_points = kept.copy()  # not yet in a plane that was tried
     for _ in range(_TRIED):
-        plane = dominant_plane(points[open_points], margin, seed, local=True)
+        plane = dominant_plane(points[open_points], margin, random_seed, local=True)
         if plane is None:
             break
         height = plane.height(points)
