@@ -32,7 +32,7 @@ def dominant_plane(
 ) -> Plane | None:
     """Return the plane with the most points nearer to it than `margin`, refined by all of those; None if there is none.
 
-    Planes through three random points are compared, so that the same `random_seed` gives the same plane. Those of `local`
+    Planes through three random points are compared: the same `random_seed` gives the same plane. Those of `local`
     triples lie near to each other, which finds planes that hold few of the points.
     """
     generator = np.random.default_rng(random_seed)
