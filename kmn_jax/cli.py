@@ -36,17 +36,17 @@ class Request:
     camera: Path | None = None
     """JSON with fx, fy, cx, cy, or cam_K, and perhaps depth_scale; depth images outside of BOP datasets need it."""
     at: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """X,Y,Z: search around this point of the scene only; it may be given several times."""
+    """X,Y,Z: the pose of the copy at this point of the scene only; may be given several times."""
     units: Units = "auto"
     """Unit of the scene's lengths; auto: that of the object, or what the format says."""
     object_units: Units = "auto"
     """Unit of the object's lengths; auto: what the format says, else millimetres."""
     random_seed: int = 0
-    """Of all that is random: the same inputs and number give the same poses."""
+    """Number that all randomness starts from: the same inputs and number give the same poses."""
     background: Path | None = None
-    """Scan of the empty bin, of the scene's format and unit: what is near to it is no part."""
+    """Scan of the empty bin, of the scene's format and unit: what is near to it is not searched."""
     roi: str | None = None
-    """XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX: only points inside of this box of the scene's frame can be parts."""
+    """XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX: only points inside of this box of the scene's frame are searched."""
     plane: Literal["auto", "always", "never"] = "auto"
     """Whether to leave out the largest plane, what is behind it, and a bin's walls; auto: if larger than the object."""
     thorough: bool = False
