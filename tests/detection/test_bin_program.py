@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import experiments
-from kmn_jax.bop import bop_scan
 from kmn_jax.detection import (
     BinPoses,
     BinPosesConfig,
@@ -25,7 +24,6 @@ from kmn_jax.detection import (
     device_part,
 )
 from kmn_jax.errors import InputError
-from kmn_jax.geometry import intrinsics
 from kmn_jax.objects import Part
 from kmn_jax.pose import adi
 
@@ -54,16 +52,13 @@ def on_device(estimator: PoseEstimator, motor: Part) -> OnDevice:
 
 
 @pytest.fixture(scope="module")
-def seen() -> Seen:
+def seen(estimator: PoseEstimator, motor: Part) -> Seen:
     """The image, which of its pixels are above the floor, and the true poses."""
-    scan, instances = bop_scan(IMAGE)
-    assert instances is not None
-    assert scan.depth is not None
-    assert scan.camera is not None
-    floor = np.median(scan.depth[scan.depth > 0])
-    above = (scan.depth > 0) & (scan.depth < floor - FLOOR_MARGIN)
-    truth = np.array([one.T_camera_object for one in instances], dtype=np.float32)
-    return DepthImage(jnp.asarray(scan.depth), intrinsics(scan.camera)), jnp.asarray(above), truth
+    scene = estimator.scene(IMAGE, motor)
+    assert scene.truth is not None
+    floor = np.median(scene.depth[scene.depth > 0])
+    above = (scene.image.depth > 0) & (scene.image.depth < floor - FLOOR_MARGIN)
+    return scene.image, above, np.array(scene.truth, dtype=np.float32)
 
 
 def solve(
