@@ -78,18 +78,17 @@ def detect(
     search = replace(config.search, crops=config.search.crops.of_network(model.config))
     on_device, warnings = device_part(model, part), scene.warnings
     propose = partial(search_at, model, on_device, scene, random_seed=random_seed, config=search)
-    if at is not None:
+    if at is None:
+        found, more = explore(scene, part, propose, probabilities.found, config, clock)
+        warnings = (*warnings, *more)
+    else:
         with clock("search"):
             found = propose(seeds_at(scene, at))
             found = found._replace(usable=found.usable & found.is_first)
-        calibration = probabilities.found
-        with clock("selection"):
-            choice = chosen(found, calibration, on_device, config)
-    else:
-        found, more = explore(scene, part, propose, probabilities.found, config, clock)
-        warnings = (*warnings, *more)
-        with clock("selection"):
-            choice = chosen(found, probabilities.found, on_device, config)
+    calibration = probabilities.found
+    with clock("selection"):
+        choice = chosen(found, calibration, on_device, config)
+    if at is None:
         calibration = probabilities.refined
         if choice.kept.any():
             with clock("refinement"):

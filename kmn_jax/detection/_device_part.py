@@ -89,9 +89,7 @@ def main_turns(
             pose[:3, 3] = center - pose[:3, :3] @ center
             turns.append(pose)
     poses = np.array(turns, dtype=np.float32)
-    moved = _moved(
-        jnp.asarray(poses), jnp.asarray(part.points[:_COMPARED]), jnp.asarray(symmetry_transforms(part.symmetries))
-    )
+    moved = _moved(jnp.asarray(poses), jnp.asarray(part.points[:_COMPARED]), jnp.asarray(symmetries))
     surface, some = cKDTree(points), points[:_COMPARED]
     apart = [surface.query(some @ pose[:3, :3].T + pose[:3, 3])[0].mean() for pose in turns]
     return poses, (np.asarray(moved) > _SAME * part.diameter) & (np.array(apart) <= _SIMILAR * part.diameter)
