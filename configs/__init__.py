@@ -9,13 +9,23 @@ from configs.debug import debug
 from configs.normalization import normalization_metric, normalization_released
 from configs.paper import paper, paper_tenth
 from configs.per_object import per_object
-from configs.small import small
+from configs.small import small, worlds
 from kmn_jax.errors import InputError
 from kmn_jax.train._config import TrainConfig
 
 CONFIGS: dict[str, TrainConfig] = {
     config.name: config
-    for config in (paper, paper_tenth, base, small, per_object, normalization_metric, normalization_released, debug)
+    for config in (
+        paper,
+        paper_tenth,
+        base,
+        small,
+        worlds,
+        per_object,
+        normalization_metric,
+        normalization_released,
+        debug,
+    )
 }
 
 

@@ -11,8 +11,12 @@ small
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from kmn_jax.data import CropConfig, PipelineConfig
+from kmn_jax.geometry import SmoothConfig
 from kmn_jax.models import KeyMatchNetConfig
+from kmn_jax.simulate import FaultConfig, WorldConfig
 from kmn_jax.train import ExampleConfig, OptimizerConfig, TrainConfig
 
 small = TrainConfig(
@@ -52,4 +56,18 @@ small = TrainConfig(
     validation_samples=20,
     checkpoint_every=200,
     log_every=50,
+)
+
+worlds = replace(
+    small,
+    name="worlds",
+    pack="outputs/packs/surfels",
+    warm_start="small",
+    num_steps=9_000,
+    examples=replace(
+        small.examples,
+        worlds=WorldConfig(),
+        crops=replace(small.examples.crops, other_seeds=0.12, faults=FaultConfig(), smooth=SmoothConfig()),
+    ),
+    optimizer=replace(small.optimizer, learning_rate=1e-2),
 )

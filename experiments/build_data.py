@@ -219,6 +219,8 @@ def print_summary(folder: Path, records: list[Record]) -> None:
             np.concatenate([fact[key] for fact in facts])
             for key in ("penetrations", "capped", "attempts", "floor_shares")
         )
+        if not len(deepest):
+            return
         print(
             f"{len(deepest)} scenes: deepest penetration {deepest.max():.3%} of the diagonal, {capped.mean():.2%} at"
             f" the time cap, {attempts.sum() - len(attempts)} drops repeated, {floors.mean():.0%} of parts on the floor"

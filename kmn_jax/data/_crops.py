@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import SmoothConfig, draw_rows, nearest, orient_to_camera, transform_points, with_normals
-from kmn_jax.simulate import BIN, VisiblePoints
+from kmn_jax.simulate import BIN, FaultConfig, VisiblePoints, displaced, draw_faults, measured
 from kmn_jax.typing import Pose, PRNGKey, Scalar
 
 NormalSource = Literal["estimated", "surface"]
@@ -40,6 +40,8 @@ class CropConfig:
     min_points: int = 16  # a crop of fewer is not valid
     min_visible_fraction: float = 0.1  # of the seed's copy, see VisiblePoints
     instance_seeds: float = 0.0  # share of seeds that lie on a random copy, whatever picture area it covers
+    other_seeds: float = 0.0  # share of seeds that lie on no copy, but on the background or on a part of another kind
+    faults: FaultConfig | None = None  # of the depth sensor, beside the noise
 
     def __post_init__(self) -> None:
         if not 1 <= self.min_points <= self.num_points:
@@ -55,8 +57,9 @@ class CropConfig:
                 f"normal_radius = {self.normal_radius} must be above zero"
                 f" and normal_points = {self.normal_points} at least 3"
             )
-        if not 0 <= self.instance_seeds <= 1:
-            raise InputError(f"instance_seeds = {self.instance_seeds} is a share: it must be between 0 and 1")
+        for name in ("instance_seeds", "other_seeds"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"{name} = {getattr(self, name)} is a share: it must be between 0 and 1")
 
     @property
     def num_drawn(self) -> int:
@@ -73,11 +76,11 @@ class LabelledCrop(NamedTuple):
     points: Float[Array, "n 3"]
     normals: Float[Array, "n 3"]  # unit, towards the camera
     mask: Bool[Array, " n"]  # false for padding, where points and normals are zero
-    is_object: Bool[Array, " n"]  # on the same copy as the seed
+    is_object: Bool[Array, " n"]  # on the same copy as the seed; nowhere if that is on none
     keypoint: Int[Array, " n"]  # nearest keypoint of that copy; means nothing where is_object is false
     seed: Float[Array, " 3"]  # in the camera frame
-    instance: Int[Array, ""]  # of the seed
-    T_crop_object: Pose  # of the seed's copy
+    instance: Int[Array, ""]  # of the seed: the index of a copy, or below zero
+    T_crop_object: Pose  # of the seed's copy, if it is on one
     noise: Scalar  # standard deviation per coordinate, in the points' unit
     num_inside: Int[Array, ""]  # visible points within the radius, of which at most n were drawn
     valid: Bool[Array, ""]
@@ -90,14 +93,16 @@ def draw_crop(
     T_camera_object: Float[Array, "c 4 4"],
     diameter: Scalar,
     config: CropConfig = CropConfig(),
+    seeds: Bool[Array, " r"] | None = None,
 ) -> LabelledCrop:
     """Draw a seed among the visible object points, in proportion to the picture area covered, and the crop around it.
 
-    In the configured share of the draws, the seed's copy is drawn first, all being equally likely.
+    In the configured share of the draws, the seed's copy is drawn first, all being equally likely. `seeds` are the rows
+    that may be one; all unless given.
     """
     _check_points(visible)
     seed_key, crop_key = jax.random.split(key)
-    row, found = _draw_seed(seed_key, visible, config)
+    row, found = _draw_seed(seed_key, visible, config, seeds)
     return labelled_crop_around(crop_key, visible, row, found, keypoints_object, T_camera_object, diameter, config)
 
 
@@ -121,6 +126,14 @@ def labelled_crop_around(
     draw_key, sigma_key, noise_key = jax.random.split(key, 3)
     weights = jnp.where(visible.mask, visible.picture_area, 0)
     x, y, z = (visible.points[:, axis] - visible.points[seed_row, axis] for axis in range(3))
+    faults = None
+    if config.faults is not None:
+        fault_key, loss_key, depth_key = jax.random.split(jax.random.fold_in(key, 1), 3)
+        faults = draw_faults(fault_key, config.faults)
+        place = visible.points[seed_row]
+        weights = jnp.where(
+            measured(loss_key, faults, visible.points, visible.normals, visible.mask, diameter, place), weights, 0
+        )
     inside = found & (weights > 0) & (x**2 + y**2 + z**2 <= (config.radius * diameter) ** 2)
     if not config.include_bin:
         inside = inside & (visible.instance != BIN)
@@ -129,7 +142,12 @@ def labelled_crop_around(
 
     exact = jnp.where(drawn[:, None], visible.points[rows], 0)
     sigma = config.max_noise * diameter * jax.random.uniform(sigma_key)
-    noisy = exact + sigma * jnp.clip(jax.random.normal(noise_key, exact.shape), -_MOST_SIGMAS, _MOST_SIGMAS)
+    if faults is not None:
+        exact_normals = jnp.where(drawn[:, None], visible.normals[rows], 0)
+        seen = jnp.where(drawn[:, None], displaced(depth_key, faults, exact, exact_normals, diameter), 0)
+    else:
+        seen = exact
+    noisy = seen + sigma * jnp.clip(jax.random.normal(noise_key, exact.shape), -_MOST_SIGMAS, _MOST_SIGMAS)
     seed = jnp.where(found, noisy[0], 0)
     noisy = jnp.where(drawn[:, None], noisy - seed[None], 0)
 
@@ -142,7 +160,8 @@ def labelled_crop_around(
         seed, points = seed + points[0], jnp.where(mask[:, None], points - points[:1], 0)
 
     instance = jnp.where(found, visible.instance[seed_row], 0)
-    pose = jnp.where(found, T_camera_object[instance].astype(jnp.float32), jnp.eye(4))
+    on_copy = found & (instance >= 0)
+    pose = jnp.where(on_copy, T_camera_object[jnp.maximum(instance, 0)].astype(jnp.float32), jnp.eye(4))
     keypoint, _ = nearest(exact, transform_points(pose, keypoints_object))
     num_inside = inside.sum(dtype=jnp.int32)
 
@@ -153,7 +172,7 @@ def labelled_crop_around(
         points=padded(points),
         normals=padded(normals),
         mask=padded(mask),
-        is_object=padded(mask & (visible.instance[rows] == instance)),
+        is_object=padded(mask & on_copy & (visible.instance[rows] == instance)),
         keypoint=padded(keypoint.astype(jnp.int32)),
         seed=seed,
         instance=instance,
@@ -169,18 +188,25 @@ def _check_points(visible: VisiblePoints) -> None:
         raise InputError("visible holds no points: a scene needs at least one copy and one surfel")
 
 
-def _draw_seed(key: PRNGKey, visible: VisiblePoints, config: CropConfig) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+def _draw_seed(
+    key: PRNGKey, visible: VisiblePoints, config: CropConfig, seeds: Bool[Array, " r"] | None
+) -> tuple[Int[Array, ""], Bool[Array, ""]]:
     """Return the row of a random point on a copy of which enough is visible, and whether there is one."""
     place_key, share_key, copy_key = jax.random.split(key, 3)
-    on_copy = visible.instance != BIN
+    on_copy = visible.instance >= 0
     enough = visible.visible_fraction >= config.min_visible_fraction
-    some = visible.mask & (visible.picture_area > 0) & on_copy & enough[jnp.where(on_copy, visible.instance, 0)]
-    weights = jnp.where(some, visible.picture_area, 0)
+    seen = visible.mask & (visible.picture_area > 0)
+    if seeds is not None:
+        seen = seen & seeds
+    weights = jnp.where(seen & on_copy & enough[jnp.where(on_copy, visible.instance, 0)], visible.picture_area, 0)
     if config.instance_seeds > 0:
         drawable = enough & (visible.visible_fraction > 0)
         copy = jax.random.categorical(copy_key, jnp.where(drawable, 0.0, -jnp.inf))
         whole = jax.random.uniform(share_key) >= config.instance_seeds
         weights = jnp.where(whole | (visible.instance == copy), weights, 0)
+    if config.other_seeds > 0:
+        elsewhere = jax.random.uniform(jax.random.fold_in(key, 1)) < config.other_seeds
+        weights = jnp.where(elsewhere, jnp.where(seen & ~on_copy, visible.picture_area, 0), weights)
     # In whole numbers, whose running sums never fall and are exact.
     ends = jnp.cumsum((weights * (2.0**30 / jnp.maximum(weights.sum(), _TINY))).astype(jnp.int32))
     place = jax.random.randint(place_key, (), 0, jnp.maximum(ends[-1], 1))

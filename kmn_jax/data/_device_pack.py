@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -67,12 +67,12 @@ class StackedPack:
     digest: str  # SHA-256 of the names and the files' checksums, in the order of the rows
 
 
-def stack_pack(pack: Pack, objects: str | Sequence[str], visibility: bool = True) -> StackedPack:
+def stack_pack(pack: Pack, objects: str | Sequence[str], visibility: bool = True, scenes: bool = True) -> StackedPack:
     """Read the objects of a split, or those of the given names, in the manifest's or the given order, and stack them.
 
-    Without `visibility` there are no bits, and scenes must be splatted. Objects that are damaged, or lack drops
-    or bits, are left out and named. Raises InputError if none is left, if a name is unknown or twice there, or if
-    objects differ in their numbers of surfels.
+    Without `visibility` there are no bits, and scenes must be splatted; without `scenes` there are surfels alone.
+    Objects that are damaged, or lack drops or bits, are left out and named. Raises InputError if none is left, if a
+    name is unknown or twice there, or if objects differ in their numbers of surfels.
     """
     wanted = pack.names(objects) if isinstance(objects, str) else list(objects)
     unknown = [name for name in wanted if name not in pack.entries]
@@ -83,7 +83,8 @@ def stack_pack(pack: Pack, objects: str | Sequence[str], visibility: bool = True
     problems = []
     for name in wanted:
         try:
-            items.append(_usable(pack.load(name, visibility), visibility))
+            item = pack.load(name, visibility and scenes)
+            items.append(_usable(item, visibility) if scenes else replace(item, drops=()))
         except InputError as error:
             problems.append(f"{name}: {error}")
     if not items:
@@ -91,7 +92,7 @@ def stack_pack(pack: Pack, objects: str | Sequence[str], visibility: bool = True
         raise InputError(f"{pack.folder} gives no objects: {reason}")
     for what, counts in (
         ("surfels", [len(item.points) for item in items]),
-        ("bytes of bits for the bin", [_num_bin_bits(item.drops[0]) for item in items]),
+        ("bytes of bits for the bin", [_num_bin_bits(item.drops[0]) if item.drops else 0 for item in items]),
     ):
         other = next((row for row, count in enumerate(counts) if count != counts[0]), None)
         if other is not None:
@@ -103,7 +104,7 @@ def stack_pack(pack: Pack, objects: str | Sequence[str], visibility: bool = True
     entries = (pack.entries[name] for name in kept)
     lines = (f"{e.name} {e.objects.sha256} {e.visibility.sha256 if e.visibility else ''}\n" for e in entries)
     digest = hashlib.sha256("".join(lines).encode()).hexdigest()
-    return StackedPack(_stack(items, visibility), kept, tuple(problems), digest)
+    return StackedPack(_stack(items, visibility and scenes), kept, tuple(problems), digest)
 
 
 def take_scene(pack: DevicePack, object: Int32[Array, ""], drop: Int32[Array, ""]) -> PackedScene:
@@ -163,7 +164,7 @@ def _num_bin_bits(drop: Drop) -> int:
 def _stack(items: Sequence[PackedObject], visibility: bool) -> DevicePack:
     num_drops = np.array([len(item.drops) for item in items], dtype=np.int32)
     shape = (len(items), int(num_drops.max()))
-    capacity = max(len(drop.scene.T_bin_object) for item in items for drop in item.drops)
+    capacity = max((len(drop.scene.T_bin_object) for item in items for drop in item.drops), default=0)
     poses = np.zeros((*shape, capacity, 4, 4), dtype=np.float32)
     num_copies = np.zeros(shape, dtype=np.int32)
     cameras, sizes = np.zeros((*shape, 6), dtype=np.float32), np.zeros((*shape, 3), dtype=np.float32)

@@ -41,7 +41,7 @@ class PackConfig:
 
     surfels: int = 4096  # a multiple of 8
     bin_surfels: int = 8192  # likewise
-    drops: int = 20
+    drops: int = 20  # 0: surfels alone, for worlds that are made inside of the training step
     copies: tuple[int, int] = (1, 20)  # of the first and of the last drop, evenly spaced between
     visibility: bool = True
     hulls: HullConfig = field(default_factory=HullConfig)
@@ -52,8 +52,8 @@ class PackConfig:
     def __post_init__(self) -> None:
         if self.surfels < 8 or self.surfels % 8 or self.bin_surfels < 8 or self.bin_surfels % 8:
             raise InputError(f"surfels = {self.surfels} and bin_surfels = {self.bin_surfels} must be multiples of 8")
-        if self.drops < 1 or not 1 <= self.copies[0] <= self.copies[1] <= 255:
-            raise InputError(f"drops = {self.drops} must be 1 or more, copies = {self.copies} a range within 1 to 255")
+        if self.drops < 0 or not 1 <= self.copies[0] <= self.copies[1] <= 255:
+            raise InputError(f"drops = {self.drops} must be 0 or more, copies = {self.copies} a range within 1 to 255")
 
     @property
     def copies_per_drop(self) -> Int[np.ndarray, " d"]:
@@ -75,9 +75,9 @@ def pack_object(
         "m"
     )
     times.append(time.perf_counter())
-    shape = collision_shape(model.vertices, model.triangles, config.hulls)
+    shape = collision_shape(model.vertices, model.triangles, config.hulls) if config.drops else None
     times.append(time.perf_counter())
-    drops, results = bin_scenes(shape, config, int(model.digest[:8], 16) + scenes)
+    drops, results = bin_scenes(shape, config, int(model.digest[:8], 16) + scenes) if shape else ([], [])
     times.append(time.perf_counter())
     item = PackedObject(
         name=name,
@@ -89,7 +89,7 @@ def pack_object(
         drops=tuple(Drop(scene) for scene in drops),
         digest=model.digest,
     )
-    if config.visibility:
+    if config.visibility and drops:
         mesh, exact = RayMesh(model.vertices, model.triangles), quantised(item)
         bits = [visibility_bits(mesh, exact, drop.scene, config.bin_surfels) for drop in exact.drops]
         item = replace(item, drops=tuple(Drop(scene, *pair) for scene, pair in zip(drops, bits, strict=True)))
@@ -97,7 +97,7 @@ def pack_object(
     return item, {
         "seconds": dict(zip(("model", "hulls", "physics", "visibility"), np.diff(times).tolist(), strict=True)),
         "hidden_share": model.hidden_share,
-        "hulls": len(shape.parts),
+        "hulls": len(shape.parts) if shape else 0,
         "penetrations": [result.penetration for result in results],
         "capped": [result.capped for result in results],
         "attempts": [result.attempts for result in results],

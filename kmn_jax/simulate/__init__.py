@@ -1,12 +1,15 @@
 """Bins of an object's copies: physics, cameras, exact and splatted views, and what a depth sensor makes of them."""
 
 from kmn_jax.simulate._bin_scene import Bin, BinScene
+from kmn_jax.simulate._containers import Container, container_surfels, hidden_by_container
+from kmn_jax.simulate._faults import FaultConfig, Faults, displaced, draw_faults, measured
 from kmn_jax.simulate._hulls import CollisionShape, HullConfig, collision_shape
 from kmn_jax.simulate._physics import BinConfig, DropResult, settle
 from kmn_jax.simulate._raycast import RayMesh, pack_bits, render, visible_bin_surfels, visible_surfels
 from kmn_jax.simulate._sensor import PERFECT, SensorConfig, sense
 from kmn_jax.simulate._splat import (
     BIN,
+    FOREIGN,
     BinInView,
     SplatConfig,
     Surfels,
@@ -16,9 +19,11 @@ from kmn_jax.simulate._splat import (
     visible_from_bits,
 )
 from kmn_jax.simulate._views import CameraConfig, place_camera
+from kmn_jax.simulate._worlds import World, WorldConfig, make_world
 
 __all__ = [
     "BIN",
+    "FOREIGN",
     "PERFECT",
     "Bin",
     "BinConfig",
@@ -26,15 +31,26 @@ __all__ = [
     "BinScene",
     "CameraConfig",
     "CollisionShape",
+    "Container",
     "DropResult",
+    "FaultConfig",
+    "Faults",
     "HullConfig",
     "RayMesh",
     "SensorConfig",
     "SplatConfig",
     "Surfels",
     "VisiblePoints",
+    "World",
+    "WorldConfig",
     "bin_surfels",
     "collision_shape",
+    "container_surfels",
+    "displaced",
+    "draw_faults",
+    "hidden_by_container",
+    "make_world",
+    "measured",
     "pack_bits",
     "place_camera",
     "render",

@@ -19,7 +19,8 @@ from kmn_jax.errors import InputError
 from kmn_jax.geometry import Intrinsics, inverse
 from kmn_jax.typing import Mask, Normals, Points, Pose, Scalar
 
-BIN = -1  # the instance of points on the bin
+BIN = -1  # the instance of points on the bin, and of all else that is no part
+FOREIGN = -2  # that of points on parts of another kind
 
 # Of the plastic number, in units of 2**-32: the two-dimensional sequence that spreads most evenly (Roberts, "R2").
 _STEPS = (3242174889, 2447445414)
@@ -73,6 +74,14 @@ class SplatConfig:
             raise InputError(f"resolution = {self.resolution} and num_bin_surfels = {self.num_bin_surfels} are too few")
 
 
+def evenly_spread(count: int) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Return points of the unit square that follow a fixed rule and spread evenly, however many are taken."""
+    # Exact in integers, which wrap around where a fraction starts again.
+    index = jnp.arange(1, count + 1, dtype=jnp.uint32)
+    first, second = (((index * jnp.uint32(step)) >> 8).astype(jnp.float32) / 2**24 for step in _STEPS)
+    return first, second
+
+
 @partial(jax.jit, static_argnames="count")
 def bin_surfels(size: Float[Array, " 3"], count: int) -> Surfels:
     """Return points on the floor and the inner walls of a bin of inner length, width and height, in its frame.
@@ -83,9 +92,7 @@ def bin_surfels(size: Float[Array, " 3"], count: int) -> Surfels:
     length, width, height = size
     floor, perimeter = length * width, 2 * (length + width)
     area = floor + perimeter * height
-    # Exact in integers, which wrap around where a fraction starts again.
-    index = jnp.arange(1, count + 1, dtype=jnp.uint32)
-    fractions = [((index * jnp.uint32(step)) >> 8).astype(jnp.float32) / 2**24 for step in _STEPS]
+    fractions = evenly_spread(count)
     along = fractions[0] * area
     on_floor = along < floor
     # The floor, and then the walls unrolled from one corner: +x, +y, -x, -y.
@@ -128,12 +135,12 @@ def visible_from_bits(
     if (bin_in_view is None) != (bin_bits is None):
         raise InputError("bin_in_view and bin_bits belong together: give both or none")
     visible = jnp.unpackbits(bits, axis=1, bitorder="little").reshape(-1) > 0
-    placed = _place(surfels, T_camera_object, copies)
+    placed = place_surfels(surfels, T_camera_object, copies)
     if bin_in_view is None or bin_bits is None:
-        return _gather(len(copies), (placed, visible))
+        return visible_points_of(len(copies), (placed, visible))
     on_bin = _place_bin(bin_in_view, 8 * bin_bits.shape[0], bin_splits)
     bin_visible = jnp.tile(jnp.unpackbits(bin_bits, bitorder="little") > 0, bin_splits**2)
-    return _gather(len(copies), (placed, visible), (on_bin, bin_visible))
+    return visible_points_of(len(copies), (placed, visible), (on_bin, bin_visible))
 
 
 def visible_by_splatting(
@@ -152,41 +159,45 @@ def visible_by_splatting(
     camera below it sees only what rises above it.
     """
     spacing = jnp.sqrt(surfels.area / surfels.points.shape[0])
-    placed = _place(surfels, T_camera_object, copies)
-    drawn = _facing(placed) & _in_image(placed, camera)
-    buffer = _draw(placed, drawn, spacing, config.resolution)
-    visible = drawn & _unhidden(placed, buffer, spacing)
+    placed = place_surfels(surfels, T_camera_object, copies)
+    drawn = facing(placed) & _in_image(placed, camera)
+    buffer = draw_discs(placed, drawn, spacing, config.resolution)
+    visible = drawn & unhidden(placed, buffer, spacing)
     if bin_in_view is None:
-        return _gather(len(copies), (placed, visible))
+        return visible_points_of(len(copies), (placed, visible))
     on_bin = _place_bin(bin_in_view, config.num_bin_surfels)
-    bin_visible = _facing(on_bin) & _in_image(on_bin, camera) & _unhidden(on_bin, buffer, spacing)
+    bin_visible = facing(on_bin) & _in_image(on_bin, camera) & unhidden(on_bin, buffer, spacing)
     parts = ((rows, seen & _over_rim(rows, bin_in_view)) for rows, seen in ((placed, visible), (on_bin, bin_visible)))
-    return _gather(len(copies), *parts)
+    return visible_points_of(len(copies), *parts)
 
 
-class _Placed(NamedTuple):
+class PlacedSurfels(NamedTuple):
     """Surfels in the camera frame, one array per coordinate: sums over an axis of 3 are slow on CPUs."""
 
     points: tuple[Float[Array, " r"], Float[Array, " r"], Float[Array, " r"]]
     normals: tuple[Float[Array, " r"], Float[Array, " r"], Float[Array, " r"]]
     plane: Float[Array, " r"]  # points . normals, below zero where the surface faces the camera
-    area: Scalar  # of one surfel
+    area: Float[Array, "*rows"]  # of one surfel, or of each
     real: Mask
 
 
-class _Buffer(NamedTuple):
+class DepthBuffer(NamedTuple):
+    """Depths over the part of the picture that surfels take."""
+
     depth: Float[Array, " pixels"]  # infinite where nothing was drawn
     low: tuple[Scalar, Scalar]  # x / z and y / z at the centre of the first pixel
     pitch: tuple[Scalar, Scalar]  # from pixel to pixel
 
 
-def _place(surfels: Surfels, T_camera_object: Float[Array, "c 4 4"], copies: Bool[Array, " c"]) -> _Placed:
-    m = surfels.points.shape[0]
+def place_surfels(surfels: Surfels, T_camera_object: Float[Array, "c 4 4"], copies: Bool[Array, " c"]) -> PlacedSurfels:
+    """Return the surfels of all copies in the camera frame; those of each, if they have a leading axis for copies."""
+    m = surfels.points.shape[-2]
     pose = jnp.where(copies[:, None, None], T_camera_object.astype(jnp.float32), jnp.eye(4)[None])
 
-    def rotated(vectors: Float[Array, "m 3"]) -> list[Float[Array, " r"]]:
+    def rotated(vectors: Float[Array, "*c m 3"]) -> list[Float[Array, " r"]]:
         # Not as a product of matrices: what follows is computed with it in one go.
-        columns = vectors.T[:, None, :]
+        columns = jnp.moveaxis(vectors, -1, 0)
+        columns = columns[:, None, :] if vectors.ndim == 2 else columns
         rows = [
             sum((pose[:, i, j, None] * columns[j] for j in range(1, 3)), pose[:, i, 0, None] * columns[0])
             for i in range(3)
@@ -199,10 +210,11 @@ def _place(surfels: Surfels, T_camera_object: Float[Array, "c 4 4"], copies: Boo
     x, y, z = points
     nx, ny, nz = normals
     plane = x * nx + y * ny + z * nz
-    return _Placed((x, y, z), (nx, ny, nz), plane, surfels.area / m, jnp.repeat(copies, m))
+    area = jnp.repeat(surfels.area, m) / m if surfels.area.ndim else surfels.area / m
+    return PlacedSurfels((x, y, z), (nx, ny, nz), plane, area, jnp.repeat(copies, m))
 
 
-def _place_bin(bin_in_view: BinInView, count: int, splits: int = 1) -> _Placed:
+def _place_bin(bin_in_view: BinInView, count: int, splits: int = 1) -> PlacedSurfels:
     surfels = bin_surfels(bin_in_view.size, count)
     if splits > 1:
         side = jnp.sqrt(surfels.area / count)
@@ -212,21 +224,22 @@ def _place_bin(bin_in_view: BinInView, count: int, splits: int = 1) -> _Placed:
         steps = [(2 * step + 1 - splits) / (2 * splits) for step in range(splits)]
         parts = [surfels.points + side * (u * first + v * second) for u in steps for v in steps]
         surfels = Surfels(jnp.concatenate(parts), jnp.tile(surfels.normals, (splits**2, 1)), surfels.area)
-    return _place(surfels, bin_in_view.T_camera_bin[None], jnp.ones(1, dtype=bool))
+    return place_surfels(surfels, bin_in_view.T_camera_bin[None], jnp.ones(1, dtype=bool))
 
 
-def _facing(placed: _Placed) -> Mask:
+def facing(placed: PlacedSurfels) -> Mask:
+    """Tell which surfels turn towards the camera and lie in front of it."""
     return placed.real & (placed.plane < 0) & (placed.points[2] > 0)
 
 
-def _in_image(placed: _Placed, camera: Intrinsics) -> Mask:
+def _in_image(placed: PlacedSurfels, camera: Intrinsics) -> Mask:
     x, y, z = placed.points
     # Multiplied by z, which is above zero where it matters; the first pixel's centre is at (0, 0).
     column, row = camera.fx * x + (camera.cx + 0.5) * z, camera.fy * y + (camera.cy + 0.5) * z
     return (column >= 0) & (column < camera.width * z) & (row >= 0) & (row < camera.height * z)
 
 
-def _over_rim(placed: _Placed, bin_in_view: BinInView) -> Mask:
+def _over_rim(placed: PlacedSurfels, bin_in_view: BinInView) -> Mask:
     """Tell which points the bin's walls do not hide: the line of sight leaves the bin through its opening."""
     length, width, height = bin_in_view.size
     to_bin = inverse(bin_in_view.T_camera_bin)
@@ -240,7 +253,7 @@ def _over_rim(placed: _Placed, bin_in_view: BinInView) -> Mask:
     return (z >= height) | (across & (eye[2] > height))
 
 
-def _draw(placed: _Placed, drawn: Mask, spacing: Scalar, size: int) -> _Buffer:
+def draw_discs(placed: PlacedSurfels, drawn: Mask, spacing: Float[Array, "*rows"], size: int) -> DepthBuffer:
     """Draw each surfel's disc at the four pixels around its projection and keep the least depth."""
     x, y, z = placed.points
     directions = [coordinate / jnp.where(drawn, z, 1) for coordinate in (x, y)]
@@ -251,9 +264,9 @@ def _draw(placed: _Placed, drawn: Mask, spacing: Scalar, size: int) -> _Buffer:
         for bound, worst in ((jnp.min, jnp.inf), (jnp.max, -jnp.inf))
     )
     mean_depth = jnp.where(some, jnp.where(drawn, z, 0).sum() / jnp.maximum(count, 1).astype(jnp.float32), 1)
-    finest = _PIXEL * spacing / mean_depth
+    finest = _PIXEL * spacing.min() / mean_depth
     pitch = [jnp.maximum((end - begin) / (size - 1), finest) for begin, end in zip(low, high, strict=True)]
-    buffer = _Buffer(jnp.full(size * size, jnp.inf), (low[0], low[1]), (pitch[0], pitch[1]))
+    buffer = DepthBuffer(jnp.full(size * size, jnp.inf), (low[0], low[1]), (pitch[0], pitch[1]))
     columns, rows = _pixels(placed.points, buffer)
     nearest_column, nearest_row = jnp.round(columns), jnp.round(rows)
     first_column, first_row = jnp.floor(columns), jnp.floor(rows)
@@ -274,7 +287,7 @@ def _draw(placed: _Placed, drawn: Mask, spacing: Scalar, size: int) -> _Buffer:
     return buffer._replace(depth=jax.lax.scan(draw_corner, buffer.depth, corners)[0])
 
 
-def _unhidden(placed: _Placed, buffer: _Buffer, spacing: Scalar) -> Bool[Array, " r"]:
+def unhidden(placed: PlacedSurfels, buffer: DepthBuffer, spacing: Float[Array, "*rows"]) -> Bool[Array, " r"]:
     """Tell which points that face the camera are, lifted off their surface, at most the tolerance behind the buffer."""
     size, lift = math.isqrt(len(buffer.depth)), _LIFT * spacing
     x, y, z = (place + lift * normal for place, normal in zip(placed.points, placed.normals, strict=True))
@@ -285,7 +298,7 @@ def _unhidden(placed: _Placed, buffer: _Buffer, spacing: Scalar) -> Bool[Array, 
 
 
 def _pixels(
-    points: tuple[Float[Array, " r"], Float[Array, " r"], Float[Array, " r"]], buffer: _Buffer
+    points: tuple[Float[Array, " r"], Float[Array, " r"], Float[Array, " r"]], buffer: DepthBuffer
 ) -> list[Float[Array, " r"]]:
     x, y, z = points
     safe = jnp.where(z > 0, z, 1)
@@ -293,7 +306,11 @@ def _pixels(
 
 
 def _plane_depth(
-    placed: _Placed, buffer: _Buffer, columns: Float[Array, " r"], rows: Float[Array, " r"], spacing: Scalar
+    placed: PlacedSurfels,
+    buffer: DepthBuffer,
+    columns: Float[Array, " r"],
+    rows: Float[Array, " r"],
+    spacing: Float[Array, "*rows"],
 ) -> tuple[Float[Array, " r"], Float[Array, " r"], Float[Array, " r"]]:
     """Return x / z and y / z at pixel centres, and the depth there of each surfel's plane, kept near its own."""
     nx, ny, nz = placed.normals
@@ -303,7 +320,7 @@ def _plane_depth(
     return u, v, jnp.clip(depth, z - reach, z + reach)
 
 
-def _gather(num_copies: int, *parts: tuple[_Placed, Bool[Array, " _"]]) -> VisiblePoints:
+def visible_points_of(num_copies: int, *parts: tuple[PlacedSurfels, Bool[Array, " _"]]) -> VisiblePoints:
     """Join the surfels of the copies, and those of the bin if given, with which of them are visible."""
     points, normals = (
         jnp.stack([jnp.concatenate(column) for column in zip(*rows, strict=True)], axis=1)
@@ -311,7 +328,7 @@ def _gather(num_copies: int, *parts: tuple[_Placed, Bool[Array, " _"]]) -> Visib
     )
     areas = [_picture_area(placed) for placed, _ in parts]
     _, visible = parts[0]
-    unhidden = areas[0].reshape(num_copies, -1).sum(axis=1)
+    whole = areas[0].reshape(num_copies, -1).sum(axis=1)
     seen = jnp.where(visible, areas[0], 0).reshape(num_copies, -1).sum(axis=1)
     instances = [jnp.repeat(jnp.arange(num_copies, dtype=jnp.int32), visible.shape[0] // num_copies)]
     instances += [jnp.full(on_bin.shape, BIN, dtype=jnp.int32) for _, on_bin in parts[1:]]
@@ -321,12 +338,12 @@ def _gather(num_copies: int, *parts: tuple[_Placed, Bool[Array, " _"]]) -> Visib
         jnp.concatenate(areas),
         jnp.concatenate(instances),
         jnp.concatenate([visible & placed.real for placed, visible in parts]),
-        seen / jnp.where(unhidden > 0, unhidden, 1),
+        seen / jnp.where(whole > 0, whole, 1),
     )
 
 
-def _picture_area(placed: _Placed) -> Float[Array, " r"]:
+def _picture_area(placed: PlacedSurfels) -> Float[Array, " r"]:
     """Return area x cosine / distance^2, divided by the cosine cubed of the angle to the optical axis."""
-    facing = _facing(placed)
-    depth = jnp.where(facing, placed.points[2], 1)
-    return jnp.where(facing, -placed.plane / depth**3, 0) * placed.area
+    turned = facing(placed)
+    depth = jnp.where(turned, placed.points[2], 1)
+    return jnp.where(turned, -placed.plane / depth**3, 0) * placed.area

@@ -29,6 +29,7 @@ class TrainConfig:
     crops_at_once: int | None = None  # that a device computes side by side; None: all of its share of a batch
     average_decay: float = 0.0  # of the running mean of the parameters that is evaluated and shipped; 0: the last ones
     random_seed: int = 0
+    warm_start: str | None = None  # a released model's name or a file of weights, instead of random parameters
     training_share: float = 1.0  # of the pack's training objects, spread evenly over its list
     validate_every: int = 1000  # steps
     validation_samples: int = 20  # of each validation object

@@ -13,7 +13,7 @@ from kmn_jax.data import CropConfig, DevicePack, draw_crop, take_scene, visible_
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import farthest_point_indices, nearest, random_rotation, transform_points
 from kmn_jax.models import KeyMatchNetConfig
-from kmn_jax.simulate import SplatConfig
+from kmn_jax.simulate import SplatConfig, Surfels, VisiblePoints, WorldConfig, make_world
 from kmn_jax.typing import PRNGKey
 
 _MOST_SIGMAS = 3.0  # noise is clipped there, as published
@@ -29,6 +29,7 @@ class ExampleConfig:
     crops: CropConfig = field(default_factory=CropConfig)
     visibility: Literal["bits", "splat"] = "bits"  # of the pack's views, or found anew for them in the step
     splat: SplatConfig = field(default_factory=SplatConfig)
+    worlds: WorldConfig | None = None  # scenes are made in the step, of the pack's surfels; its own are not used
     crops_per_scene: int = 1  # crops of an object that come from the first one's scene: finding what is seen costs most
     random_keypoints: float = 0.6  # share of examples whose keypoints are random points, not farthest ones
     rotate_object: bool = True
@@ -120,12 +121,16 @@ def make_group(
     keypoints = points[indices]
 
     def of_scene(drop: Int[Array, ""], keys: UInt32[Array, "s 2"]) -> tuple[Array, ...]:
-        scene = take_scene(pack, row, drop)
-        visible = visible_points(scene, config.splat if config.visibility == "splat" else None)
+        if config.worlds is not None:
+            visible, poses, near = _world(keys[0], pack, row, config.worlds)
+        else:
+            scene = take_scene(pack, row, drop)
+            visible = visible_points(scene, config.splat if config.visibility == "splat" else None)
+            poses, near = scene.T_camera_object, None
 
         def crop(key: UInt32[Array, " 2"]) -> tuple[Array, ...]:
             crop_key = jax.random.fold_in(jax.random.wrap_key_data(key), 0)
-            made = draw_crop(crop_key, visible, keypoints, scene.T_camera_object, diameter, config.crops)
+            made = draw_crop(crop_key, visible, keypoints, poses, diameter, config.crops, near)
             cloud = jnp.concatenate([made.points, made.normals], axis=1)
             return cloud, made.mask, made.is_object, made.keypoint, made.valid
 
@@ -141,6 +146,20 @@ def make_group(
     each = config.crops_per_scene
     scenes = jax.lax.map(lambda pair: of_scene(*pair), (drops[::each], keys.reshape(-1, each, 2)))
     return Group(cloud, indices, length, *(leaf.reshape(-1, *leaf.shape[2:]) for leaf in scenes))
+
+
+def _world(
+    key: UInt32[Array, " 2"], pack: DevicePack, row: Int[Array, ""], config: WorldConfig
+) -> tuple[VisiblePoints, Float[Array, "c 4 4"], Bool[Array, " r"]]:
+    """Return what is seen of a new world, where its copies are, and which points lie in the middle of it."""
+    world_key, row_key = jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(key), 2))
+    points, normals, area = (jnp.asarray(array) for array in (pack.points, pack.normals, pack.area))
+    other = jax.random.randint(row_key, (), 0, points.shape[0])
+    shapes = [Surfels(points[which], normals[which], area[which]) for which in (row, other)]
+    diameter = jnp.asarray(pack.diameter)[row]
+    world = make_world(world_key, *shapes, diameter, config)
+    away = world.visible.points - world.centre[None]
+    return world.visible, world.T_camera_object, (away**2).sum(axis=1) < diameter**2
 
 
 def _cloud_rows(key: PRNGKey, total: int, count: int, config: ExampleConfig) -> Int[Array, " count"]:

@@ -43,7 +43,7 @@ from kmn_jax.train._sharding import (
     put_whole,
 )
 from kmn_jax.train._snapshot import Snapshot
-from kmn_jax.train._sources import ignore, trained_network, training_source, validation_source
+from kmn_jax.train._sources import ignore, trained_network, training_source, validation_source, warm_parameters
 from kmn_jax.train._step import Metrics, Samples, create_state, index_of, mean_metrics, total_sums
 from kmn_jax.train._stop import StopRequest
 from kmn_jax.train._window import MEANS, Window
@@ -127,7 +127,7 @@ class _Run:
         )
         self.saved_graphdef = model_structure(trained_network(config)).graphdef
         optimizer, num_steps = config.optimizer, config.num_steps
-        self.graphdef, state = create_state(config.step, optimizer.build(num_steps))
+        self.graphdef, state = create_state(config.step, optimizer.build(num_steps), warm_parameters(config))
         self.state = put_whole(state, mesh)
         self.train_step = jit_train_step(self.graphdef, optimizer, num_steps, config.step, mesh)
         self.eval_step = jit_eval_step(self.graphdef, config.step, mesh)

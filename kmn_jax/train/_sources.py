@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import jax
 import numpy as np
+from flax import nnx
 from jax.sharding import Mesh
 from jaxtyping import Int32
 
 from kmn_jax.data import DevicePack, Pack, PipelineConfig, SampleBatches, SampleIndex, stack_pack
 from kmn_jax.errors import InputError
-from kmn_jax.models import KeyMatchNetConfig
+from kmn_jax.models import KeyMatchNetConfig, load_model, load_pretrained
 from kmn_jax.train._config import TrainConfig
 from kmn_jax.train._rendered import rendered_frames
 from kmn_jax.train._sharding import put_whole
@@ -76,6 +78,20 @@ def trained_network(config: TrainConfig) -> KeyMatchNetConfig:
     return replace(config.network, object_digest=digests.pop())
 
 
+def warm_parameters(config: TrainConfig) -> nnx.State | None:
+    """Return the parameters to begin with, if a warm start is configured.
+
+    Raises InputError if the weights cannot be read or are of another network than the config's.
+    """
+    if config.warm_start is None:
+        return None
+    known = Path(config.warm_start).suffix == ".safetensors"
+    model = load_model(config.warm_start) if known else load_pretrained(config.warm_start)
+    if model.config != config.network:
+        raise InputError(f"warm_start = {config.warm_start} holds another network than the config's: leave it out")
+    return model.parameters
+
+
 def _packed_source(
     config: TrainConfig,
     pack: Pack,
@@ -85,7 +101,8 @@ def _packed_source(
     report: Report,
     ordered: bool = False,
 ) -> Source:
-    stacked = stack_pack(pack, objects, config.examples.visibility == "bits")
+    worlds = config.examples.worlds is not None
+    stacked = stack_pack(pack, objects, config.examples.visibility == "bits", scenes=not worlds)
     arrays, needed = stacked.arrays, config.network.num_object_points
     if arrays.points.shape[1] < needed:  # before anything is written: steps could not be compiled
         raise InputError(
@@ -94,7 +111,7 @@ def _packed_source(
         )
     for problem in stacked.problems:
         report(problem)
-    batches = _own_batches(pipeline, len(stacked.names), np.asarray(arrays.num_drops), ordered)
+    batches = _own_batches(pipeline, len(stacked.names), 1 if worlds else np.asarray(arrays.num_drops), ordered)
     return Source(put_whole(arrays, mesh), stacked.names, stacked.digest, batches)
 
 

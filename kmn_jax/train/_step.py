@@ -90,9 +90,12 @@ _Result = TypeVar("_Result")
 SumGradients: TypeAlias = Callable[[nnx.State, DevicePack, Samples, Array], tuple[nnx.State, Sums]]
 
 
-def create_state(config: StepConfig, optimizer: optax.GradientTransformation) -> tuple[nnx.GraphDef, TrainState]:
-    """Return the network's structure and the state before the first step."""
-    graphdef, parameters = create_model(config.network, jax.random.key(config.random_seed))
+def create_state(
+    config: StepConfig, optimizer: optax.GradientTransformation, parameters: nnx.State | None = None
+) -> tuple[nnx.GraphDef, TrainState]:
+    """Return the network's structure and the state before the first step, with random parameters unless given."""
+    graphdef, drawn = create_model(config.network, jax.random.key(config.random_seed))
+    parameters = drawn if parameters is None else parameters
     state = TrainState(jnp.int32(0), parameters, jax.tree.map(jnp.copy, parameters), optimizer.init(parameters))
     return graphdef, state
 
