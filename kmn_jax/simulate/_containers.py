@@ -111,11 +111,10 @@ def hidden_by_container(
         hidden = hidden | (walls & ~inside & (z < level) & within)
     for axis, (here, there) in enumerate(((x, eye[0]), (y, eye[1]))):
         place, top = container.divider[axis], container.divider_height[axis]
-        step = jnp.where(jnp.abs(there - here) > _SLACK, there - here, _SLACK)
-        share = (place - here) / step
-        crossing = z + share * (eye[2] - z)
+        way = (place - here) / jnp.where(jnp.abs(there - here) > _SLACK, there - here, _SLACK)
+        crossing = z + way * (eye[2] - z)
         beside = jnp.abs(here - place) > container.divider_width / 2 + _SLACK
-        hidden = hidden | (inside & beside & (share > 0) & (share < 1) & (crossing < top))
+        hidden = hidden | (inside & beside & (way > 0) & (way < 1) & (crossing < top))
     return hidden
 
 

@@ -108,27 +108,26 @@ def make_world(key: PRNGKey, part: Surfels, other: Surfels, diameter: Scalar, co
     )
     background = background._replace(real=background.real & real)
     eye = -(T_camera_container[:3, :3] * T_camera_container[:3, 3:]).sum(axis=0)
-    kept = _removal(keys[6], container, centre - offset, config)
+    removal = _draw_removal(keys[6], centre - offset, config)
 
-    def seen(rows: PlacedSurfels, spacing: Array, margin: Scalar) -> Bool[Array, " r"]:
+    def seen(rows: PlacedSurfels, spacing: Array, is_background: bool) -> Bool[Array, " r"]:
         rotation, translation = T_camera_container[:3, :3], T_camera_container[:3, 3]
         away = [rows.points[i] - translation[i] for i in range(3)]
         x, y, z = (sum((rotation[j, i] * away[j] for j in range(1, 3)), rotation[0, i] * away[0]) for i in range(3))
         over = ~hidden_by_container(container, eye, x, y, z)
-        return facing(rows) & unhidden(rows, buffer, spacing) & over & kept(x, y, z, margin)
+        left = _left(removal, container, x, y, z, is_background)
+        return facing(rows) & unhidden(rows, buffer, spacing) & over & left
 
-    fine = spacing.min()
     visible = visible_points_of(
         config.slots,
-        (placed, seen(placed, spacing, jnp.float32(0))),
-        (background, seen(background, fine, jnp.inf)),
+        (placed, seen(placed, spacing, False)),
+        (background, seen(background, spacing.min(), True)),
     )
     own = jnp.concatenate([is_foreign, jnp.zeros(1, dtype=bool)])[visible.instance]  # BIN is the last one
     fraction = jnp.where(is_foreign, 0, visible.visible_fraction)
     poses = T_camera_world @ T_world_object
     visible = visible._replace(
         points=visible.points * diameter,
-        picture_area=visible.picture_area,
         instance=jnp.where(own & (visible.instance != BIN), FOREIGN, visible.instance),
         visible_fraction=fraction,
     )
@@ -277,29 +276,39 @@ def _draw_camera(key: PRNGKey, target: Float[Array, "3"], config: WorldConfig) -
     return jnp.eye(4).at[:3, :3].set(rotation).at[:2, 3].set(translation[:2] + aside).at[2, 3].set(translation[2])
 
 
-def _removal(key: PRNGKey, container: Container, centre: Float[Array, "3"], config: WorldConfig):  # type: ignore[no-untyped-def]
-    """Return a function that tells which points are left where the background was removed, well or badly."""
-    keys = jax.random.split(key, 5)
+class _Removal(NamedTuple):
+    """How the background of a scene was taken away: wholly, or badly, or not at all."""
+
+    whole: Bool[Array, ""]
+    bad: Bool[Array, ""]
+    margin: Scalar  # nearer to floor and walls, points of the parts go too where it was done badly, ...
+    patches: Float[Array, "p 3"]  # ... and background stays in these balls
+    radii: Float[Array, " p"]
+
+
+def _draw_removal(key: PRNGKey, centre: Float[Array, "3"], config: WorldConfig) -> _Removal:
+    keys = jax.random.split(key, 4)
     place = jax.random.uniform(keys[0])
-    removed = place < config.removed
-    half = ~removed & (place < config.removed + config.half_removed)
-    margin = 0.004 * 10 ** jax.random.uniform(keys[1])
-    patches = centre[None] + 0.7 * jax.random.normal(keys[2], (3, 3))
-    radii = 0.5 * jax.random.uniform(keys[3], (3,))
+    whole = place < config.removed
+    return _Removal(
+        whole,
+        ~whole & (place < config.removed + config.half_removed),
+        0.004 * 10 ** jax.random.uniform(keys[1]),
+        centre[None] + 0.7 * jax.random.normal(keys[2], (3, 3)),
+        0.5 * jax.random.uniform(keys[3], (3,)),
+    )
 
-    def kept(x: Array, y: Array, z: Array, background: Scalar) -> Bool[Array, " r"]:
+
+def _left(removal: _Removal, container: Container, x: Array, y: Array, z: Array, background: bool) -> Bool[Array, " r"]:
+    """Tell which points, of the background or of parts, are left."""
+    if background:
         left = jnp.zeros_like(x, dtype=bool)
-        for patch, radius in zip(patches, radii, strict=True):
+        for patch, radius in zip(removal.patches, removal.radii, strict=True):
             left = left | ((x - patch[0]) ** 2 + (y - patch[1]) ** 2 + (z - patch[2]) ** 2 < radius**2)
-        is_background = jnp.isinf(background)
-        walls = container.height > 0
-        wide = container.half + container.slope * jnp.clip(z, 0)[:, None]
-        near_wall = walls & ((jnp.abs(x) > wide[:, 0] - margin) | (jnp.abs(y) > wide[:, 1] - margin))
-        cut = half & ~is_background & ((z < margin) | near_wall)
-        gone = is_background & (removed | (half & ~left))
-        return ~(gone | cut)
-
-    return kept
+        return ~(removal.whole | (removal.bad & ~left))
+    wide = container.half[None] + container.slope * jnp.clip(z, 0)[:, None] - removal.margin
+    at_wall = (container.height > 0) & ((jnp.abs(x) > wide[:, 0]) | (jnp.abs(y) > wide[:, 1]))
+    return ~(removal.bad & ((z < removal.margin) | at_wall))
 
 
 def _check_shares(config: WorldConfig, names: tuple[str, ...]) -> None:

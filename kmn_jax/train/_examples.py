@@ -155,9 +155,9 @@ def _world(
     world_key, row_key = jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(key), 2))
     points, normals, area = (jnp.asarray(array) for array in (pack.points, pack.normals, pack.area))
     other = jax.random.randint(row_key, (), 0, points.shape[0])
-    shapes = [Surfels(points[which], normals[which], area[which]) for which in (row, other)]
+    own, foreign = (Surfels(points[which], normals[which], area[which]) for which in (row, other))
     diameter = jnp.asarray(pack.diameter)[row]
-    world = make_world(world_key, *shapes, diameter, config)
+    world = make_world(world_key, own, foreign, diameter, config)
     away = world.visible.points - world.centre[None]
     return world.visible, world.T_camera_object, (away**2).sum(axis=1) < diameter**2
 

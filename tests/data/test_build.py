@@ -162,7 +162,7 @@ def test_refuses_what_cannot_be_built_before_it_starts(tmp_path: Path) -> None:
     ("fields", "message"),
     [
         ({"surfels": 100}, "multiples of 8"),
-        ({"drops": 0}, "drops = 0 must be 1 or more"),
+        ({"drops": -1}, "drops = -1 must be 0 or more"),
         ({"copies": (3, 2)}, r"copies = \(3, 2\) a range"),
         ({"copies": (1, 300)}, "within 1 to 255"),
     ],

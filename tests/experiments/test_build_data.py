@@ -85,7 +85,7 @@ def test_extracts_only_what_is_named_from_the_package(tmp_path: Path, monkeypatc
         (["electronics", "--models", "absent"], "error: absent is not a folder"),
         (["electronics", "--models", "experiments"], "1507 of 1507 files are missing"),
         (["electronics", "--models", "experiments", "--limit", "0"], "limit = 0 must be 1 or more"),
-        (["electronics", "--pack.drops", "0"], "drops = 0 must be 1 or more"),
+        (["electronics", "--pack.drops", "-1"], "drops = -1 must be 0 or more"),
         (["check", "--folder", "experiments"], "manifest.json cannot be read"),
     ],
 )

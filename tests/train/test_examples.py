@@ -13,7 +13,9 @@ import pytest
 
 from kmn_jax.data import CropConfig, Pack, StackedPack, draw_crop, stack_pack, take_scene, visible_points
 from kmn_jax.errors import InputError
+from kmn_jax.geometry import SmoothConfig
 from kmn_jax.models import KeyMatchNetConfig
+from kmn_jax.simulate import FaultConfig, WorldConfig
 from kmn_jax.train import ExampleConfig
 from kmn_jax.train._examples import Group, RenderedCrops, make_group
 from tests.reference.meshes import pose, random_rotations
@@ -181,3 +183,22 @@ def test_a_pack_of_too_few_surfels_is_refused(stacked: StackedPack) -> None:
     network = replace(NETWORK, num_object_points=8192)
     with pytest.raises(InputError, match="the pack has 4096 surfels an object, but num_object_points = 8192"):
         make_group(stacked.arrays, jnp.int32(0), jnp.zeros(1, dtype=jnp.int32), keys(0, 1), network, CONFIG)
+
+
+def test_worlds_make_crops_of_copies_and_of_none() -> None:
+    stacked = stack_pack(Pack(PACK), "train", scenes=False)
+    assert stacked.arrays.T_camera_object.shape[1] == 0
+    crops = CropConfig(num_points=64, normal_points=256, other_seeds=0.5, faults=FaultConfig(), smooth=SmoothConfig())
+    worlds = WorldConfig(background_points=2048, resolution=128)
+    config = replace(CONFIG, crops=crops, crops_per_scene=4, worlds=worlds)
+    shares = []
+    for seed in range(6):
+        found = group(stacked, seed, config)
+        assert all(bool(jnp.isfinite(leaf).all()) for leaf in found)
+        valid = np.asarray(found.valid)
+        on_copy = np.asarray(found.is_object)
+        # The seed is the first point: on a copy, or nothing of the crop is.
+        np.testing.assert_array_equal(on_copy[valid].any(axis=1), on_copy[valid, 0])
+        shares += on_copy[valid, 0].tolist()
+    assert len(shares) >= 16
+    assert 0.1 < np.mean(shares) < 0.9

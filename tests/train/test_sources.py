@@ -5,13 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
 
 from configs import find_config
 from kmn_jax.data import Pack
 from kmn_jax.data._pack import write_manifest, write_object
 from kmn_jax.errors import InputError
-from kmn_jax.train._sources import trained_network
+from kmn_jax.models import create_model, save_model
+from kmn_jax.train._sources import trained_network, warm_parameters
 
 DEBUG = find_config("debug")
 SMALL_PACK = Path(__file__).parent.parent.parent / DEBUG.pack
@@ -34,3 +37,14 @@ def test_networks_of_any_object_know_none(tmp_path: Path) -> None:
 def test_several_objects_are_refused() -> None:
     with pytest.raises(InputError, match=r"objects, but a network with learned features is of one"):
         trained_network(replace(LEARNED, pack=str(SMALL_PACK)))
+
+
+def test_a_warm_start_begins_with_the_weights_of_a_file(tmp_path: Path) -> None:
+    assert warm_parameters(DEBUG) is None
+    model = create_model(DEBUG.network, jax.random.key(7))
+    save_model(model, tmp_path / "some.safetensors")
+    found = warm_parameters(replace(DEBUG, warm_start=str(tmp_path / "some.safetensors")))
+    for leaf, wanted in zip(jax.tree.leaves(found), jax.tree.leaves(model[1]), strict=True):
+        np.testing.assert_array_equal(leaf, wanted)
+    with pytest.raises(InputError, match="another network than the config's"):
+        warm_parameters(replace(DEBUG, warm_start="small"))
