@@ -150,10 +150,10 @@ def _faces(container: Container) -> list[tuple[_Face, int]]:
             length = outer[other] if axis == 0 else opening[other]  # corners belong to the first two rims
             add(at(sign * opening[axis], length, height), side, out, [2 * length, walls * rim], z)
             add(at(middle + sign * width / 2, opening[other], zero), side, z, [wide, top], out, _BETWEEN)
-        above = [wide, (top > 0) * width]
+        above = [wide, jnp.where(top > 0, width, 0)]
         add(at(middle - width / 2, opening[other], top), side, (x, y)[axis], above, z, _BETWEEN)
     # Of the next container, what is seen over the gap: its outer side, its rim, and the far wall from inside.
-    there = walls * jnp.isfinite(container.gap)
+    there = jnp.where(jnp.isfinite(container.gap), walls, 0)
     begin = outer[0] + jnp.where(jnp.isfinite(container.gap), container.gap, 0)
     add([begin, -outer[1], -lift], y, z, [there * 2 * outer[1], height + lift], -x)
     add([begin, -outer[1], height], x, y, [rim, there * 2 * outer[1]], z)

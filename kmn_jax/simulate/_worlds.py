@@ -213,8 +213,8 @@ def _arranged(
     centres = jnp.where(in_rows, centres[:1] + grid * pitch[None], centres)
     # Between the walls, as far as a part fits there.
     room = jnp.where(container.height > 0, container.half, jnp.inf)
-    least = jnp.minimum(-room + shift + extent[:, :2] / 2, shift)
-    most = jnp.maximum(room + shift - extent[:, :2] / 2, shift)
+    least = jnp.minimum((shift - room)[None] + extent[:, :2] / 2, shift[None])
+    most = jnp.maximum((shift + room)[None] - extent[:, :2] / 2, shift[None])
     centres = jnp.clip(centres, least, most)
     count = jax.random.randint(keys[9], (), 1, slots + 1)
     order = jax.random.permutation(jax.random.fold_in(keys[9], 1), slots)
