@@ -79,7 +79,8 @@ def test_symmetric_objects():
 
 def test_mssd_counts_the_identity_among_the_symmetries():
     _, true, points = make_case(3)
-    assert mssd(true, true, points, discretise_symmetry(jnp.array([1.0, 0, 0]), jnp.zeros(3), 3)[1:]) == 0
+    turns = discretise_symmetry(jnp.array([1.0, 0, 0]), jnp.zeros(3), 3)[1:]
+    assert mssd(true, true, points, turns) < 1e-5  # the nearest of the turns is a whole part away
 
 
 def test_discretised_symmetry():
