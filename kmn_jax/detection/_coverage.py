@@ -72,19 +72,32 @@ def cover(
 
     centers = (found.T_camera_object @ np.append((part.minimum + part.maximum) / 2, 1))[:, :3]
     likely = np.flatnonzero(likely)
-    size = min(len(part.points), _SURFACE_POINTS)
-    surface, near = cKDTree(part.points[:size]), config.explained * part.diameter + float(np.sqrt(part.area / size))
-    for row in likely:
-        local = into(found.T_camera_object[row].astype(np.float64), scene.points[rows])
-        inside = np.flatnonzero(((local >= part.minimum - near) & (local <= part.maximum + near)).all(axis=1))
-        distance, _ = surface.query(local[inside], distance_upper_bound=near)
-        rows = np.delete(rows, inside[np.isfinite(distance)])
-    left = np.zeros_like(before.left)
-    left[rows] = True
+    left = unexplained(before.left, scene, part, found.T_camera_object[likely], config)
 
     apart = np.linalg.norm(before.places[None] - centers[likely][:, None], axis=2)
     new = (apart > reach).all(axis=1).any()
     return Coverage(left, away, np.concatenate([before.places, centers[likely]]), 0 if new else before.barren + 1)
+
+
+def unexplained(
+    rows: Bool[np.ndarray, " r"],
+    scene: Scene,
+    part: Part,
+    T_camera_object: Float[np.ndarray, "k 4 4"],
+    config: CoverageConfig,
+) -> Bool[np.ndarray, " r"]:
+    """Return which of a scene's chosen points lie near to the part's surface at none of the poses."""
+    from scipy.spatial import cKDTree
+
+    left = np.flatnonzero(rows)
+    size = min(len(part.points), _SURFACE_POINTS)
+    surface, near = cKDTree(part.points[:size]), config.explained * part.diameter + float(np.sqrt(part.area / size))
+    for pose in T_camera_object.astype(np.float64):
+        local = into(pose, scene.points[left])
+        inside = np.flatnonzero(((local >= part.minimum - near) & (local <= part.maximum + near)).all(axis=1))
+        distance, _ = surface.query(local[inside], distance_upper_bound=near)
+        left = np.delete(left, inside[np.isfinite(distance)])
+    return np.isin(np.arange(len(rows)), left)
 
 
 def to_search(state: Coverage, scene: Scene, part: Part, config: CoverageConfig) -> Bool[np.ndarray, " r"]:

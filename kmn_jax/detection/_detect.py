@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from kmn_jax.detection._calibration import Calibration, Probabilities
 from kmn_jax.detection._canonical import canonical_pose
-from kmn_jax.detection._coverage import CoverageConfig, cover, nothing_covered, to_search
+from kmn_jax.detection._coverage import CoverageConfig, cover, nothing_covered, to_search, unexplained
 from kmn_jax.detection._crop_search import CropPoses
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place
 from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
@@ -33,7 +33,12 @@ from kmn_jax.objects import Part
 _SHARES = ("explained", "violated", "occluded", "unknown")
 _CLOSE_GAP = 0.05  # of probabilities
 _CONSIDERED = 128  # most probable poses that are compared with each other: one number, so one compilation
+_MOST_UNEXPLAINED = 0.5  # of the foreground: with more, it is told how to narrow it down
 _SYMMETRIC = "the object is symmetric: of the poses that look the same, this is the canonical one"
+_NARROW = (
+    ": on walls, rims and tables poses may be wrong though they are called probable; give the scan without parts"
+    " (--background), or the box that parts are in (--roi)"
+)
 _RIVALLED = "another pose in this place is nearly as probable: the object may lie the other way round"
 
 
@@ -98,8 +103,16 @@ def detect(
                 choice = chosen(found, calibration, on_device, config)
     with clock("report"):
         poses = detections(found, choice, calibration, part, scene)
+        accepted = choice.kept & (calibration.probability(found.evidence) >= config.accepted)
+        left = unexplained(scene.foreground, scene, part, found.T_camera_object[accepted], config.coverage)
+        share, points = left.sum() / scene.foreground.sum(), placed(scene.T_scene_camera, scene.points[left])
     reason = None if poses else "; ".join(filter(None, (_reason(found, part), scene.doubt)))
-    return Detections(part.name, scene.unit, poses, clock.timing, reason, warnings)
+    result = Detections(part.name, scene.unit, poses, clock.timing, reason, warnings)
+    if at is not None:
+        return result
+    if share > _MOST_UNEXPLAINED and not scene.is_narrowed:
+        warnings = (*warnings, f"{share:.0%} of the foreground is on no pose that was found{_NARROW}")
+    return replace(result, warnings=warnings, unexplained=float(share), unexplained_points=points.astype(np.float32))
 
 
 def explore(

@@ -30,6 +30,7 @@ def as_json(found: Detections, object_name: str, scene_name: str, facts: Mapping
             **{f"{stage}_s": seconds for stage, seconds in found.timing.stages.items()},
         },
         "reason": found.reason,
+        "unexplained": found.unexplained,
         "warnings": list(found.warnings),
         **facts,
     }
@@ -80,6 +81,8 @@ def table(found: Detections, accepted: float) -> str:
         lines += sorted({f"note: {warning}" for pose in found.poses for warning in pose.warnings})
     else:
         lines.append(f"{found.part}: nothing found, because {found.reason}")
+    if found.unexplained is not None:
+        lines.append(f"{found.unexplained:.0%} of the foreground is on no pose that was found")
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in found.timing.stages.items())
     running = found.timing.total - found.timing.compile
     lines.append(f"{running:.2f} s ({stages}) and {found.timing.compile:.2f} s of compiling")

@@ -63,3 +63,5 @@ class Detections:
     timing: Timing
     reason: str | None = None  # why there are no poses, in one sentence; None if there are
     warnings: tuple[str, ...] = field(default_factory=tuple)  # about the scene
+    unexplained: float | None = None  # share of the foreground on no pose that counts as found; None: of places alone
+    unexplained_points: Float32[np.ndarray, "u 3"] | None = None  # those points, in the scene's frame

@@ -39,6 +39,7 @@ class Scene:
     cloud: PaddedCloud  # the points again, on the device
     image: DepthImage  # the depth again, padded, on the device
     warnings: tuple[str, ...] = ()
+    is_narrowed: bool = False  # whether it was told where parts may be: by an empty bin, a region, or the truth
     doubt: str | None = None  # about its unit, told if nothing is found
     truth: tuple[Float[np.ndarray, "4 4"], ...] | None = None  # T_scene_object of all copies, if a dataset says
     bop_ids: tuple[int, int, int] = (0, 0, 1)  # scene, image and object, of an image of a BOP dataset
@@ -89,6 +90,7 @@ def make_scene(
         pad_cloud(points, LEAST_POINTS),
         DepthImage(jnp.asarray(padded), intrinsics(view.camera)),
         warnings,
+        inside is not None or (background is not None and (background.background or background.roi) is not None),
     )
 
 

@@ -17,6 +17,7 @@ from kmn_jax.viz._truth import nearest_keypoint
 
 LIKELY = 0.5  # poses below that probability are drawn pale
 NOT_THE_PART = (0.30, 0.32, 0.36)  # the colour of points of crops that are on no copy
+UNEXPLAINED = (0.62, 0.40, 0.22)  # that of foreground on no pose
 _LISTED = 16  # poses
 _LISTED_WARNINGS = 6
 _PART_SIDE = 300  # pixels

@@ -19,7 +19,7 @@ from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
 from kmn_jax.geometry import Camera
 from kmn_jax.objects import Part
-from kmn_jax.viz._legend import LIKELY, NOT_THE_PART, center_of, draw_list, draw_part, summary
+from kmn_jax.viz._legend import LIKELY, NOT_THE_PART, UNEXPLAINED, center_of, draw_list, draw_part, summary
 from kmn_jax.viz._raster import Canvas
 from kmn_jax.viz._shading import (
     as_bytes,
@@ -38,6 +38,7 @@ _PANEL = 6.4  # inches of its longer side
 _WHOLE, _CLOSEST = 0.8, 0.05  # of the scan's width: what fills more is not zoomed in on, and nothing closer than
 _MOST_CROP_POINTS = 200_000
 _IN_FRONT = 0.05  # of the diameter: what was measured that much nearer hides a pose
+_DOTS = 20_000  # of the foreground that no pose explains
 _DASH = 7  # pixels of the outlines of unlikely poses
 
 
@@ -185,10 +186,20 @@ class _Panels:
                 path_effects=[effects.withStroke(linewidth=2.5, foreground="white")],
                 annotation_clip=True,
             )
+        self._draw_unexplained(axis)
         axis.imshow(as_bytes(image), extent=self.canvas.extent, interpolation="nearest")
-        axis.set_title(f"Poses with rank and probability; dashed below {LIKELY}")
+        title = f"Poses with rank and probability; dashed below {LIKELY}"
+        if self.found.unexplained is not None:
+            title += f"; {self.found.unexplained:.0%} on none (brown)"
+        axis.set_title(title)
         if not self.found.poses:
             self._tell_why_not(axis)
+
+    def _draw_unexplained(self, axis: Any) -> None:
+        """Dot the foreground that lies on no pose that counts as found."""
+        if self.found.unexplained_points is not None:
+            points = self._in_view(self.found.unexplained_points)[:: 1 + len(self.found.unexplained_points) // _DOTS]
+            axis.scatter(*image_places(self.view.camera, points).T, s=4, c=[UNEXPLAINED], marker="s", lw=0)
 
     def _paint(
         self,

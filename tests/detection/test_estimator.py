@@ -84,6 +84,9 @@ def test_a_bin_is_found_and_the_same_inputs_give_the_same_bits(estimator: PoseEs
     assert "found" in table(found, 0.5)
     written = as_json(found, "motor.stl", "bin.png", {"seed": 0})
     assert written["version"] == 1
+    assert written["unexplained"] == found.unexplained
+    assert found.unexplained is not None
+    assert 0 < found.unexplained < 0.9
     assert len(written["poses"]) == len(found.poses)
     assert written["timing"]["total_s"] == pytest.approx(found.timing.total)
 
@@ -114,6 +117,7 @@ def test_places_and_crops_give_the_pose_there(estimator: PoseEstimator, motor: P
     assert errors(there.poses[0].T_scene_object, truth, motor).min() < 0.1
     both = estimator.detect(motor, scene, at=np.stack([seed, other]))
     assert len(both.poses) <= 2
+    assert both.unexplained is None
     poses = np.stack([pose.T_scene_object for pose in both.poses])
     assert (poses == there.poses[0].T_scene_object).all(axis=(1, 2)).any(), "whatever else is asked for"
 
@@ -197,6 +201,8 @@ def test_a_scan_without_the_part_is_an_empty_or_doubtful_result(estimator: PoseE
     found = estimator.detect(motor, wavy.astype(np.float32), unit="mm")
     assert all(pose.probability < 0.5 for pose in found.poses)
     assert (found.reason is None) == bool(found.poses)
+    assert found.unexplained == 1
+    assert any("--background" in warning for warning in found.warnings)
     few = estimator.detect(
         motor, wavy[:30].astype(np.float32), unit="mm", background=ForegroundOptions(remove_plane="never")
     )

@@ -23,10 +23,11 @@ from kmn_jax.detection import (
     explore,
     seeds_over,
 )
+from kmn_jax.detection._coverage import unexplained
 from kmn_jax.detection._seeds import SPACING
 from kmn_jax.errors import InputError
 from kmn_jax.pose import PoseResult
-from tests.detection.box_sample import box_part, box_view
+from tests.detection.box_sample import POSES, SIZES, WALL, box_part, box_view
 
 SURE = Calibration(EVIDENCE, (0.0,) * len(EVIDENCE), 3.0)
 QUICK = DetectConfig()
@@ -123,3 +124,14 @@ def test_seeds_are_no_more_than_asked_for_or_needed(scene: Scene) -> None:
 def test_contradictory_values_are_refused(kind: type, values: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(values))):
         kind(**values)
+
+
+def test_what_lies_on_no_pose_is_unexplained(scene: Scene) -> None:
+    part, everything = box_part(), np.ones(len(scene.points), dtype=bool)
+    one, both = (unexplained(everything, scene, part, np.stack(POSES)[:n], QUICK.coverage) for n in (1, 2))
+    on_wall = scene.points[:, 2] > WALL - 1e-3
+    beside = (np.abs(scene.points[:, 0]) > POSES[1][0, 3] + SIZES[0]) | (np.abs(scene.points[:, 1]) > 2 * SIZES[1])
+    assert not both[~on_wall].any()
+    assert both[on_wall & beside].all()
+    np.testing.assert_array_equal(one[~on_wall], scene.points[~on_wall, 0] > 0)
+    assert not unexplained(~everything, scene, part, np.stack(POSES), QUICK.coverage).any()

@@ -16,6 +16,7 @@ from kmn_jax.detection import CropPrediction, Detection, Detections, Scene
 from kmn_jax.errors import InputError
 from kmn_jax.objects import Part, Symmetries
 from kmn_jax.viz import TRUTH_COLORS, distinct_colors, save_picture, truth_codes
+from kmn_jax.viz._legend import UNEXPLAINED
 from kmn_jax.viz._raster import Canvas
 from kmn_jax.viz._truth import BACKGROUND, FALSE_PART, MISSED, RIGHT, WRONG_KEYPOINT, surface_distances
 from tests.detection.box_sample import CAMERA, POSES, SIZES, both_boxes, box_part, box_view
@@ -89,6 +90,13 @@ def test_the_picture_shows_every_pose_in_its_colour(part: Part, view: Scene, fou
     assert len(one) > 300
     assert 50 < len(other) < 0.5 * len(one)
     assert one[:, 1].max() < other[:, 1].min()
+
+
+def test_what_is_on_no_pose_is_dotted(part: Part, view: Scene, found: Detections, tmp_path: Path) -> None:
+    left = view.points[(view.points[:, 1] > 0.6) & (view.points[:, 0] < 0)]
+    save_picture(tmp_path / "result.png", view, part, replace(found, unexplained=0.2, unexplained_points=left))
+    dots = places(drawn(tmp_path / "result.png"), UNEXPLAINED)
+    assert len(in_panel(drawn(tmp_path / "result.png"), dots, 1, 1)) == len(dots) > 300
 
 
 def test_keypoints_have_the_same_colours_on_the_scan_and_on_the_part(
