@@ -12,7 +12,6 @@ from kmn_jax.detection._calibration import (
     reliability,
 )
 from kmn_jax.detection._canonical import canonical_pose
-from kmn_jax.detection._coverage import CoverageConfig
 from kmn_jax.detection._crop_search import (
     CropPoses,
     CropSearchConfig,
@@ -76,7 +75,6 @@ __all__ = [
     "Calibration",
     "Candidates",
     "Clock",
-    "CoverageConfig",
     "CropPoses",
     "CropPrediction",
     "CropSearchConfig",

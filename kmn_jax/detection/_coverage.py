@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -11,32 +10,15 @@ from jaxtyping import Bool, Float
 from kmn_jax.detection._frames import into
 from kmn_jax.detection._scene import Scene
 from kmn_jax.detection._search import Candidates
-from kmn_jax.errors import InputError
 from kmn_jax.objects import Part
 
+# Shares of the object's diameter.
+EXPLAINED = 0.05  # points so near to the surface of a found part are done
+SEARCHED = 0.5  # those so near to a seed
+SEARCHED_FINELY = 0.2  # the same, as long as rounds find new copies
+_CELL = 0.4  # points are stray if few others lie in their cell
 _LEAST_CROWD = 16  # points of a cell: fewer make no crop
 _SURFACE_POINTS = 1024  # on a part
-
-
-@dataclass(frozen=True)
-class CoverageConfig:
-    """When a place counts as searched; lengths are shares of the object's diameter."""
-
-    explained: float = 0.05  # points so near to the surface of a found part are done
-    searched: float = 0.5  # those so near to a seed
-    searched_finely: float = 0.2  # the same, as long as rounds find new copies
-    patience: int | None = 2  # rounds that find none, after which it is not searched finely; None goes on
-    cell: float = 0.4  # points are stray if few others lie in their cell
-
-    def __post_init__(self) -> None:
-        """Refuse values that contradict their meaning."""
-        if not 0 < self.searched_finely <= self.searched or not min(self.explained, self.cell) > 0:
-            raise InputError(
-                f"explained = {self.explained}, searched_finely = {self.searched_finely} and cell = {self.cell} must be"
-                f" above zero, and searched = {self.searched} not below searched_finely"
-            )
-        if self.patience is not None and self.patience < 1:
-            raise InputError(f"patience = {self.patience} must be at least 1, or none")
 
 
 class Coverage(NamedTuple):
@@ -60,7 +42,6 @@ def cover(
     found: Candidates,
     likely: Bool[np.ndarray, " s"],
     reach: float,
-    config: CoverageConfig,
 ) -> Coverage:
     """Return the state after a round; a likely pose is a new copy if none before it is nearer than `reach`."""
     from scipy.spatial import cKDTree
@@ -72,7 +53,7 @@ def cover(
 
     centers = (found.T_camera_object @ np.append((part.minimum + part.maximum) / 2, 1))[:, :3]
     likely = np.flatnonzero(likely)
-    left = unexplained(before.left, scene, part, found.T_camera_object[likely], config)
+    left = unexplained(before.left, scene, part, found.T_camera_object[likely])
 
     apart = np.linalg.norm(before.places[None] - centers[likely][:, None], axis=2)
     new = (apart > reach).all(axis=1).any()
@@ -80,18 +61,14 @@ def cover(
 
 
 def unexplained(
-    rows: Bool[np.ndarray, " r"],
-    scene: Scene,
-    part: Part,
-    T_camera_object: Float[np.ndarray, "k 4 4"],
-    config: CoverageConfig,
+    rows: Bool[np.ndarray, " r"], scene: Scene, part: Part, T_camera_object: Float[np.ndarray, "k 4 4"]
 ) -> Bool[np.ndarray, " r"]:
     """Return which of a scene's chosen points lie near to the part's surface at none of the poses."""
     from scipy.spatial import cKDTree
 
     left = np.flatnonzero(rows)
     size = min(len(part.points), _SURFACE_POINTS)
-    surface, near = cKDTree(part.points[:size]), config.explained * part.diameter + float(np.sqrt(part.area / size))
+    surface, near = cKDTree(part.points[:size]), EXPLAINED * part.diameter + float(np.sqrt(part.area / size))
     for pose in T_camera_object.astype(np.float64):
         local = into(pose, scene.points[left])
         inside = np.flatnonzero(((local >= part.minimum - near) & (local <= part.maximum + near)).all(axis=1))
@@ -100,19 +77,20 @@ def unexplained(
     return np.isin(np.arange(len(rows)), left)
 
 
-def to_search(state: Coverage, scene: Scene, part: Part, config: CoverageConfig) -> Bool[np.ndarray, " r"]:
-    """Return the points to spread the next seeds over, without stray ones; none when the search is done."""
-    far = _crowded(state.left & (state.away > config.searched * part.diameter), scene, part, config)
-    if far.any() or (config.patience is not None and state.barren >= config.patience):
+def to_search(state: Coverage, scene: Scene, part: Part, patience: int | None) -> Bool[np.ndarray, " r"]:
+    """Return the points to spread the next seeds over, without stray ones; none when the search is done.
+
+    After `patience` rounds that found no copy it is not searched finely; None goes on.
+    """
+    far = _crowded(state.left & (state.away > SEARCHED * part.diameter), scene, part)
+    if far.any() or (patience is not None and state.barren >= patience):
         return far
-    return _crowded(state.left & (state.away > config.searched_finely * part.diameter), scene, part, config)
+    return _crowded(state.left & (state.away > SEARCHED_FINELY * part.diameter), scene, part)
 
 
-def _crowded(
-    chosen: Bool[np.ndarray, " r"], scene: Scene, part: Part, config: CoverageConfig
-) -> Bool[np.ndarray, " r"]:
+def _crowded(chosen: Bool[np.ndarray, " r"], scene: Scene, part: Part) -> Bool[np.ndarray, " r"]:
     rows = np.flatnonzero(chosen)
-    cells = np.floor(scene.points[rows] / (config.cell * part.diameter)).astype(np.int64)
+    cells = np.floor(scene.points[rows] / (_CELL * part.diameter)).astype(np.int64)
     _, which, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     result = np.zeros_like(chosen)
     result[rows[counts[which.reshape(-1)] >= _LEAST_CROWD]] = True

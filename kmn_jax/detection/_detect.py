@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from kmn_jax.detection._calibration import Calibration, Probabilities
 from kmn_jax.detection._canonical import canonical_pose
-from kmn_jax.detection._coverage import CoverageConfig, cover, nothing_covered, to_search, unexplained
+from kmn_jax.detection._coverage import cover, nothing_covered, to_search, unexplained
 from kmn_jax.detection._crop_search import CropPoses
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place
 from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
@@ -47,13 +47,15 @@ class DetectConfig:
     """How a scene is searched; lengths are shares of the object's diameter."""
 
     search: SearchConfig = field(default_factory=SearchConfig)
-    coverage: CoverageConfig = field(default_factory=CoverageConfig)
+    patience: int | None = 2  # rounds that find no copy, after which it is not searched finely; None goes on
     later_seeds: int = 16  # at most in a round after the first; rounds go on until the foreground is covered
     most_seeds: int = 512  # at least so many are searched before it is given up to cover the foreground
     accepted: float = 0.5  # the probability from which on a pose explains points, and counts as found
     reported: float = 0.1  # less probable poses are left out
 
     def __post_init__(self) -> None:
+        if self.patience is not None and self.patience < 1:
+            raise InputError(f"patience = {self.patience} must be at least 1, or none")
         if min(self.later_seeds, self.most_seeds) < 1 or not 0 <= self.reported <= self.accepted <= 1:
             raise InputError(
                 f"later_seeds = {self.later_seeds} and most_seeds = {self.most_seeds} must be at least 1, and reported"
@@ -61,7 +63,7 @@ class DetectConfig:
             )
 
 
-THOROUGH = DetectConfig(coverage=CoverageConfig(patience=None))
+THOROUGH = DetectConfig(patience=None)
 
 
 def detect(
@@ -104,7 +106,7 @@ def detect(
     with clock("report"):
         poses = detections(found, choice, calibration, part, scene)
         accepted = choice.kept & (calibration.probability(found.evidence) >= config.accepted)
-        left = unexplained(scene.foreground, scene, part, found.T_camera_object[accepted], config.coverage)
+        left = unexplained(scene.foreground, scene, part, found.T_camera_object[accepted])
         share, points = left.sum() / scene.foreground.sum(), placed(scene.T_scene_camera, scene.points[left])
     reason = None if poses else "; ".join(filter(None, (_reason(found, part), scene.doubt)))
     result = Detections(part.name, scene.unit, poses, clock.timing, reason, warnings)
@@ -133,8 +135,8 @@ def explore(
         with clock("coverage"):
             found = rounds[-1]
             likely = found.usable & (calibration.probability(found.evidence) >= config.accepted)
-            state = cover(state, scene, part, found, likely, reach, config.coverage)
-            free = to_search(state, scene, part, config.coverage)
+            state = cover(state, scene, part, found, likely, reach)
+            free = to_search(state, scene, part, config.patience)
         if not free.any():
             break
         if sum(len(found.seed_rows) for found in rounds) >= config.most_seeds:

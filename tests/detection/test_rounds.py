@@ -14,7 +14,6 @@ from kmn_jax.detection import (
     Calibration,
     Candidates,
     Clock,
-    CoverageConfig,
     CropPoses,
     DetectConfig,
     Prediction,
@@ -23,7 +22,7 @@ from kmn_jax.detection import (
     explore,
     seeds_over,
 )
-from kmn_jax.detection._coverage import unexplained
+from kmn_jax.detection._coverage import SEARCHED, SEARCHED_FINELY, unexplained
 from kmn_jax.detection._seeds import SPACING
 from kmn_jax.errors import InputError
 from kmn_jax.pose import PoseResult
@@ -78,7 +77,7 @@ def test_a_bin_is_searched_until_a_seed_is_near_to_all_of_it(scene: Scene) -> No
     assert max(len(seeds) for seeds in asked[1:]) == THOROUGH.later_seeds
     seeds = np.concatenate(asked)
     apart = np.linalg.norm(seeds[:, None] - seeds[None], axis=2)[np.triu_indices(len(seeds), 1)]
-    assert apart.min() > THOROUGH.coverage.searched_finely * DIAMETER
+    assert apart.min() > SEARCHED_FINELY * DIAMETER
     # But for a few stray points, and what is between the spacing of seeds and the reach of one.
     assert np.mean(nearest_seeds(asked, scene) <= SPACING * DIAMETER) > 0.98
     assert not found
@@ -87,7 +86,7 @@ def test_a_bin_is_searched_until_a_seed_is_near_to_all_of_it(scene: Scene) -> No
 def test_where_nothing_is_found_it_is_searched_coarsely(scene: Scene) -> None:
     fine, coarse = (rounds(scene, 0, config)[0] for config in (THOROUGH, QUICK))
     assert len(np.concatenate(coarse)) < len(np.concatenate(fine))
-    assert np.mean(nearest_seeds(coarse, scene) <= 1.1 * QUICK.coverage.searched * DIAMETER) > 0.98
+    assert np.mean(nearest_seeds(coarse, scene) <= 1.1 * SEARCHED * DIAMETER) > 0.98
     assert np.isin(np.concatenate(coarse), np.concatenate(fine)).all()  # it only ends earlier
 
 
@@ -109,29 +108,18 @@ def test_seeds_are_no_more_than_asked_for_or_needed(scene: Scene) -> None:
     assert len(seeds_over(scene, one_point, PART)) == 1
 
 
-@pytest.mark.parametrize(
-    ("kind", "values"),
-    [
-        (DetectConfig, {"most_seeds": 0}),
-        (DetectConfig, {"later_seeds": 0}),
-        (DetectConfig, {"reported": 0.6}),
-        (CoverageConfig, {"explained": 0.0}),
-        (CoverageConfig, {"searched": 0.1}),
-        (CoverageConfig, {"searched_finely": 0.0}),
-        (CoverageConfig, {"patience": 0}),
-    ],
-)
-def test_contradictory_values_are_refused(kind: type, values: dict[str, float]) -> None:
+@pytest.mark.parametrize("values", [{"most_seeds": 0}, {"later_seeds": 0}, {"reported": 0.6}, {"patience": 0}])
+def test_contradictory_values_are_refused(values: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(values))):
-        kind(**values)
+        DetectConfig(**values)  # type: ignore[arg-type]
 
 
 def test_what_lies_on_no_pose_is_unexplained(scene: Scene) -> None:
     part, everything = box_part(), np.ones(len(scene.points), dtype=bool)
-    one, both = (unexplained(everything, scene, part, np.stack(POSES)[:n], QUICK.coverage) for n in (1, 2))
+    one, both = (unexplained(everything, scene, part, np.stack(POSES)[:n]) for n in (1, 2))
     on_wall = scene.points[:, 2] > WALL - 1e-3
     beside = (np.abs(scene.points[:, 0]) > POSES[1][0, 3] + SIZES[0]) | (np.abs(scene.points[:, 1]) > 2 * SIZES[1])
     assert not both[~on_wall].any()
     assert both[on_wall & beside].all()
     np.testing.assert_array_equal(one[~on_wall], scene.points[~on_wall, 0] > 0)
-    assert not unexplained(~everything, scene, part, np.stack(POSES), QUICK.coverage).any()
+    assert not unexplained(~everything, scene, part, np.stack(POSES)).any()
