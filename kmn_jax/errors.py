@@ -18,6 +18,12 @@ class InputError(ValueError):
     """The caller's input cannot be used. The message is one sentence for people."""
 
 
+def require(condition: bool, message: str) -> None:
+    """Raise InputError with `message` unless the condition holds; for the checks of configs."""
+    if not condition:
+        raise InputError(message)
+
+
 def is_traced(value: object) -> bool:
     """Tell whether `value` is an abstract value inside jit, vmap or grad."""
     return isinstance(value, jax.core.Tracer)

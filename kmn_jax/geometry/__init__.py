@@ -13,7 +13,6 @@ from kmn_jax.geometry._knn import (
     squared_distances,
 )
 from kmn_jax.geometry._normals import depth_normals, depth_to_points, estimate_normals, orient_to_camera
-from kmn_jax.geometry._norms import safe_norm, safe_sqrt
 from kmn_jax.geometry._order import space_filling_order
 from kmn_jax.geometry._sampling import farthest_point_indices
 from kmn_jax.geometry._se3 import (
@@ -28,10 +27,11 @@ from kmn_jax.geometry._se3 import (
     random_rotation,
     rotate_vectors,
     rotation_angle_between,
+    safe_norm,
+    safe_sqrt,
     transform_points,
-    translation_between,
 )
-from kmn_jax.geometry._smoothing import SmoothConfig, smoothed, towards_camera, with_normals
+from kmn_jax.geometry._smoothing import SmoothConfig, smoothed, with_normals
 
 __all__ = [
     "Camera",
@@ -74,8 +74,6 @@ __all__ = [
     "space_filling_order",
     "spread_rows",
     "squared_distances",
-    "towards_camera",
     "transform_points",
-    "translation_between",
     "with_normals",
 ]

@@ -10,8 +10,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from kmn_jax.geometry._norms import safe_norm
 from kmn_jax.typing import Normals, Points, Pose, PRNGKey, Quaternion, Rotation, Scalar
+
+
+def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the square root, with gradient zero (rather than infinite) at zero."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
+
+
+def safe_norm(vectors: Float[Array, "... d"]) -> Float[Array, "..."]:
+    """Return the length of each vector, with gradient zero (rather than NaN) for the zero vector."""
+    return safe_sqrt((vectors**2).sum(axis=-1))
 
 
 def _product(a: Float[Array, "i j"], b: Float[Array, "j k"]) -> Float[Array, "i k"]:
@@ -93,14 +103,9 @@ def rotation_angle_between(R_a: Rotation, R_b: Rotation) -> Scalar:
     return 2 * jnp.arctan2(safe_norm(quaternion[1:]), quaternion[0])
 
 
-def translation_between(T_a: Pose, T_b: Pose) -> Scalar:
-    """Return the distance of the translations of two poses."""
-    return safe_norm(T_a[:3, 3] - T_b[:3, 3])
-
-
 def pose_error(T_a: Pose, T_b: Pose) -> tuple[Scalar, Scalar]:
     """Return the rotation error of two poses of the same object in radians, and the translation error."""
-    return rotation_angle_between(T_a[:3, :3], T_b[:3, :3]), translation_between(T_a, T_b)
+    return rotation_angle_between(T_a[:3, :3], T_b[:3, :3]), safe_norm(T_a[:3, 3] - T_b[:3, 3])
 
 
 def random_rotation(key: PRNGKey) -> Rotation:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, require
 from kmn_jax.geometry._ball_normals import normals_within_radius, planes_within_radius
 from kmn_jax.geometry._normals import orient_to_camera
 from kmn_jax.typing import Scalar
@@ -31,10 +31,10 @@ class SmoothConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
-        if not 0 < self.least_radius <= self.most_radius:
-            raise InputError(
-                f"least_radius = {self.least_radius} must be above zero, and most_radius = {self.most_radius} not below"
-            )
+        require(
+            0 < self.least_radius <= self.most_radius,
+            f"least_radius = {self.least_radius} must be above zero, and most_radius = {self.most_radius} not below",
+        )
         if self.radius_per_noise < 0 or self.probe_radius <= 0 or self.moved_noise <= 0:
             raise InputError("radius_per_noise must not be negative, probe_radius and moved_noise be above zero")
         if self.probes < 1 or not 0 <= self.quantile <= 1:
@@ -88,10 +88,10 @@ def with_normals(
         normals, known = normals_within_radius(points, cloud, normal_radius * diameter, cloud_mask)
     else:
         points, normals, known, _ = smoothed(points, mask, cloud, cloud_mask, diameter, smooth)
-    return points, jnp.where(mask[:, None], towards_camera(points, normals, known, camera), 0)
+    return points, jnp.where(mask[:, None], _towards_camera(points, normals, known, camera), 0)
 
 
-def towards_camera(
+def _towards_camera(
     points: Float[Array, "n 3"], normals: Float[Array, "n 3"], known: Bool[Array, " n"], camera: Float[Array, "3"]
 ) -> Float[Array, "n 3"]:
     """Return normals turned towards a camera; where one is not known, the direction to it."""

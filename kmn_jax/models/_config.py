@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, require
 from kmn_jax.models._layers import Compute
 from kmn_jax.models._pair_head import PairDropout
 
@@ -72,15 +72,14 @@ class KeyMatchNetConfig:
                 raise InputError(f"{name} is {size!r}, but must be a whole number, at least 1")
             if name in widths and size % self.groups:
                 raise InputError(f"{name} is {size}, but must be a multiple of groups = {self.groups}")
-        if not 0 <= self.dropout < 1:
-            raise InputError(f"dropout is {self.dropout}, but must be in [0, 1)")
+        require(0 <= self.dropout < 1, f"dropout is {self.dropout}, but must be in [0, 1)")
         if self.inputs == "invariant" and self.normalization == "released":
             raise InputError(
                 'inputs "invariant" need normalization "metric": "released" scales the axes of space unevenly'
             )
         if self.object_digest and self.object_branch == "cad":
             raise InputError("object_digest names the object of a network with learned features, which this is not")
-        if self.num_keypoints > self.num_object_points:
-            raise InputError(
-                f"{self.num_keypoints} keypoints cannot be drawn from {self.num_object_points} object points"
-            )
+        require(
+            self.num_keypoints <= self.num_object_points,
+            f"{self.num_keypoints} keypoints cannot be drawn from {self.num_object_points} object points",
+        )

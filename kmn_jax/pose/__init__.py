@@ -13,9 +13,7 @@ from kmn_jax.pose._metrics import (
     bounding_box_diagonal,
     diameter,
     discretise_symmetry,
-    is_correct,
     mssd,
-    nearest_instance_error,
     recall,
 )
 from kmn_jax.pose._ransac import RansacConfig, ransac, ransac_modes
@@ -38,10 +36,8 @@ __all__ = [
     "discretise_symmetry",
     "find_matches",
     "icp",
-    "is_correct",
     "kabsch",
     "mssd",
-    "nearest_instance_error",
     "ransac",
     "ransac_modes",
     "recall",

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from kmn_jax.errors import InputError, float_array, is_traced, mask_array, positive_scalar
+from kmn_jax.errors import InputError, float_array, is_traced, mask_array, positive_scalar, require
 from kmn_jax.typing import ArrayInput, Normals, Points, Scalar
 
 OBJECT_CLASS = 1  # segmentation logits are (background, object)
@@ -43,12 +43,11 @@ class MatchConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
-        if not 0 < self.vote_threshold <= 1:
-            raise InputError(f"vote_threshold is {self.vote_threshold}, but must be in (0, 1]")
-        if self.softmax not in ("keypoints", "points"):
-            raise InputError(f"softmax is {self.softmax!r}, but must be 'keypoints' or 'points'")
-        if self.capacity < 3:
-            raise InputError(f"capacity is {self.capacity}, but a pose needs at least 3 matches")
+        require(0 < self.vote_threshold <= 1, f"vote_threshold is {self.vote_threshold}, but must be in (0, 1]")
+        require(
+            self.softmax in ("keypoints", "points"), f"softmax is {self.softmax!r}, but must be 'keypoints' or 'points'"
+        )
+        require(self.capacity >= 3, f"capacity is {self.capacity}, but a pose needs at least 3 matches")
 
 
 def find_matches(

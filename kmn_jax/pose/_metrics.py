@@ -5,14 +5,12 @@ ADD and ADI: Hinterstoisser et al. 2012; MSSD and discretised symmetries: the BO
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from kmn_jax.errors import InputError, float_array, is_traced, mask_array, rigid_pose, row_count
+from kmn_jax.errors import InputError, float_array, is_traced, rigid_pose, row_count
 from kmn_jax.geometry import (
     compose,
     from_quaternion_translation,
@@ -23,8 +21,6 @@ from kmn_jax.geometry import (
     transform_points,
 )
 from kmn_jax.typing import ArrayInput, Points, Pose, Scalar
-
-PoseMetric = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
 
 
 def add(T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput) -> jax.Array:
@@ -68,29 +64,6 @@ def discretise_symmetry(axis: ArrayInput, offset: ArrayInput, count: int) -> jax
     return _turns(axis, offset, count)
 
 
-def nearest_instance_error(
-    metric: PoseMetric,
-    T_estimated: ArrayInput,
-    T_true: ArrayInput,
-    points: ArrayInput,
-    mask: ArrayInput | None = None,
-) -> jax.Array:
-    """Return the least error of a pose against several true ones (i, 4, 4), as published results take it.
-
-    `metric` is `add`, `adi` or a function like them. True poses where `mask` (i,) is false are padding; without
-    a single one the error is infinite.
-    """
-    count = row_count(T_true, "T_true")
-    mask = mask_array(mask, "mask", count)
-    truth = float_array(T_true, "T_true", (None, 4, 4), mask=None if is_traced(mask) else mask)
-    if count == 0:
-        return jnp.array(jnp.inf, dtype=jnp.float32)
-    truth = jnp.where(mask[:, None, None], truth, jnp.eye(4, dtype=truth.dtype)[None])
-    estimated, points = rigid_pose(T_estimated, "T_estimated"), _some_points(points)
-    errors = jax.vmap(lambda pose: metric(estimated, pose, points))(truth)
-    return jnp.where(mask, errors, jnp.inf).min()
-
-
 def bounding_box_diagonal(points: ArrayInput) -> jax.Array:
     """Return the diagonal of the axis-aligned box around points (m, 3): the object's size as published."""
     points = _some_points(points)
@@ -105,11 +78,6 @@ def diameter(points: ArrayInput) -> jax.Array:
     return _diameter(_some_points(points))
 
 
-def is_correct(error: ArrayInput, size: ArrayInput, threshold: float = 0.1) -> jax.Array:
-    """Tell for each error whether it is below `threshold` times the size; an error that is NaN is not."""
-    return jnp.asarray(error) < threshold * jnp.asarray(size)
-
-
 def recall(errors: ArrayInput, size: ArrayInput, threshold: float = 0.1) -> jax.Array:
     """Return the share of errors (n,) below `threshold` times the size, one for all () or one each (n,).
 
@@ -120,7 +88,7 @@ def recall(errors: ArrayInput, size: ArrayInput, threshold: float = 0.1) -> jax.
         raise InputError("errors is empty, but a share needs at least one")
     errors = float_array(errors, "errors", (count,), finite=False)
     size = float_array(size, "size", (count,) if np.ndim(size) else ())
-    return is_correct(errors, size, threshold).mean(dtype=jnp.float32)
+    return (errors < threshold * size).mean(dtype=jnp.float32)
 
 
 def _checked(T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from kmn_jax.errors import InputError, float_array, is_traced, mask_array, positive_scalar, row_count
+from kmn_jax.errors import InputError, float_array, is_traced, mask_array, positive_scalar, require, row_count
 from kmn_jax.geometry import from_rotation_translation
 from kmn_jax.pose._kabsch import fit_rigid, rotation_is_determined
 from kmn_jax.pose._matches import Matches
@@ -47,19 +47,18 @@ class RansacConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that contradict each other or their meaning."""
-        if not 1 <= self.num_hypotheses <= self.num_candidates:
-            raise InputError(
-                f"num_hypotheses is {self.num_hypotheses}, but must be between 1 and"
-                f" num_candidates = {self.num_candidates}, from which they are selected"
-            )
-        if not self.distance_gate > 0:
-            raise InputError(f"distance_gate is {self.distance_gate}, but must be above zero")
-        if not 0 < self.normal_gate_degrees <= 180:
-            raise InputError(f"normal_gate_degrees is {self.normal_gate_degrees}, but must be in (0, 180]")
-        if self.num_refinements < 0:
-            raise InputError(f"num_refinements is {self.num_refinements}, but cannot be negative")
-        if self.min_inliers < 3:
-            raise InputError(f"min_inliers is {self.min_inliers}, but any three matches agree: ask for more")
+        require(
+            1 <= self.num_hypotheses <= self.num_candidates,
+            f"num_hypotheses is {self.num_hypotheses}, but must be between 1 and"
+            f" num_candidates = {self.num_candidates}, from which they are selected",
+        )
+        require(self.distance_gate > 0, f"distance_gate is {self.distance_gate}, but must be above zero")
+        require(
+            0 < self.normal_gate_degrees <= 180,
+            f"normal_gate_degrees is {self.normal_gate_degrees}, but must be in (0, 180]",
+        )
+        require(self.num_refinements >= 0, f"num_refinements is {self.num_refinements}, but cannot be negative")
+        require(self.min_inliers >= 3, f"min_inliers is {self.min_inliers}, but any three matches agree: ask for more")
         if not 0 <= self.min_inlier_share <= 1:
             raise InputError(f"min_inlier_share is {self.min_inlier_share}, but must be in [0, 1]")
 
