@@ -14,10 +14,9 @@ from jaxtyping import Float, Float64, Int, Int32, Int64
 
 from kmn_jax.errors import InputError
 from kmn_jax.io._clouds import parse_pcd, parse_xyz
-from kmn_jax.io._obj import parse_obj
 from kmn_jax.io._ply import parse_ply
 from kmn_jax.io._step import step_to_glb
-from kmn_jax.io._stl import parse_stl
+from kmn_jax.io._stl_obj import parse_obj, parse_stl
 from kmn_jax.units import check_unit
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb", ".step", ".stp")
