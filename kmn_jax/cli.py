@@ -46,7 +46,8 @@ class Request:
     background: Path | None = None
     """Scan of the empty bin, of the scene's format and unit: what is near to it is not searched."""
     roi: str | None = None
-    """XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX: only points inside of this box of the scene's frame are searched."""
+    """XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX, or for a turned box its centre X,Y,Z, size X,Y,Z and rotation vector in degrees
+    RX,RY,RZ: only points inside of this box of the scene's frame are searched."""
     plane: Literal["auto", "always", "never"] = "auto"
     """Whether to leave out the largest plane, what is behind it, and a bin's walls; auto: if larger than the object."""
     thorough: bool = False
@@ -111,19 +112,19 @@ def detect(
     found = session.detect(session.places)
     if top is not None:
         found = replace(found, poses=found.poses[:top])
-    print(table(found, session.estimator.config.accepted))
+    # Files first: whoever reads what is printed may stop reading.
     if json is not None:
         facts = {"seed": request.random_seed, "weights": request.weights, "model": session.part.model_digest}
         write_json(as_json(found, str(request.object), str(request.scene), facts), json)
-        print(f"wrote {json}")
     if bop_csv is not None:
         write_bop_csv(found, bop_csv, *session.scene.bop_ids)
-        print(f"wrote {bop_csv}")
     if save_picture is not None:
         from kmn_jax.viz import save_picture as draw
 
         draw(save_picture, session.scene, session.part, found, session.scene.truth)
-        print(f"wrote {save_picture}")
+    print(table(found, session.estimator.config.accepted))
+    for target in filter(None, (json, bop_csv, save_picture)):
+        print(f"wrote {target}")
 
 
 def view(
@@ -201,10 +202,12 @@ class _Session:
     """An estimator with the part and the scan of a request."""
 
     def __init__(self, request: Request) -> None:
-        from kmn_jax.detection import THOROUGH, Clock, ForegroundOptions, PoseEstimator
+        from kmn_jax.detection import THOROUGH, Clock, ForegroundOptions, OrientedBox, PoseEstimator
 
         places = [_numbers(text, "--at", 3) for text in request.at]
-        region: Any = None if request.roi is None else tuple(_numbers(request.roi, "--roi", 6))
+        region: Any = None if request.roi is None else tuple(_numbers(request.roi, "--roi", 6, 9))
+        if region is not None and len(region) == 9:
+            region = OrientedBox.of_numbers(region)
         sensor = None if request.sensor is None else np.array(_numbers(request.sensor, "--sensor", 3))
         self.places = np.array(places) if places else None
         self._request, self._clock = request, Clock()
@@ -239,13 +242,14 @@ def _unit(units: Units) -> str | None:
     return None if units == "auto" else units
 
 
-def _numbers(text: str, flag: str, count: int) -> list[float]:
+def _numbers(text: str, flag: str, *counts: int) -> list[float]:
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
         values = []
-    if len(values) != count or not np.isfinite(values).all():
-        raise InputError(f"{flag} is {text!r}, but must be {count} numbers with commas between them")
+    if len(values) not in counts or not np.isfinite(values).all():
+        allowed = " or ".join(map(str, counts))
+        raise InputError(f"{flag} is {text!r}, but must be {allowed} numbers with commas between them")
     return values
 
 
@@ -289,6 +293,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         _keep_compiled()
         tyro.extras.subcommand_cli_from_dict(commands, prog="kmn", args=arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:  # nobody reads on, as in `kmn detect ... | head -1`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except InputError as error:
         print(f"kmn: {error}", file=sys.stderr)
         return 2

@@ -41,7 +41,7 @@ from kmn_jax.detection._device_part import DevicePart, device_part, same_place, 
 from kmn_jax.detection._estimator import PartSource, PoseEstimator, ScanSource
 from kmn_jax.detection._evidence import EVIDENCE, SIGNS, gather_evidence
 from kmn_jax.detection._export import export_estimator
-from kmn_jax.detection._foreground import ForegroundOptions, foreground
+from kmn_jax.detection._foreground import ForegroundOptions, OrientedBox, foreground
 from kmn_jax.detection._frames import into, placed
 from kmn_jax.detection._mapping import call_rows, map_real, map_rows
 from kmn_jax.detection._outline import OutlineAgreement, outline_agreement
@@ -89,6 +89,7 @@ __all__ = [
     "Draw",
     "DrawsSearch",
     "ForegroundOptions",
+    "OrientedBox",
     "OutlineAgreement",
     "PartSource",
     "PoseEstimator",

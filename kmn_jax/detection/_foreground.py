@@ -7,6 +7,7 @@ with all that lies behind it, seen from the sensor at the origin. For walls see 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -30,6 +31,31 @@ _PLANES = 3  # one behind the other, among which a floor is looked for
 _HINT = ": if it is the floor, give a region of interest or the empty bin"
 
 
+@dataclass(frozen=True, eq=False)
+class OrientedBox:
+    """A box that need not be in line with the scene's axes; lengths are in the scene's unit."""
+
+    T_scene_box: Float[np.ndarray, "4 4"]  # its centre and axes
+    size: Float[np.ndarray, "3"]  # along its axes
+
+    def __post_init__(self) -> None:
+        rotation, whole = self.T_scene_box[:3, :3], np.isfinite(self.T_scene_box).all() and np.isfinite(self.size).all()
+        if not whole or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
+            raise InputError("the pose of a region of interest must be a rotation and a place, all numbers finite")
+        if not (self.size > 0).all():
+            raise InputError(f"the region of interest is {self.size.tolist()} large, but each side must be above zero")
+
+    @classmethod
+    def of_numbers(cls, numbers: Sequence[float]) -> OrientedBox:
+        """Return the box of nine numbers: centre, size, and rotation vector in degrees."""
+        from scipy.spatial.transform import Rotation
+
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_rotvec(numbers[6:], degrees=True).as_matrix()
+        pose[:3, 3] = numbers[:3]
+        return cls(pose, np.array(numbers[3:6], dtype=np.float64))
+
+
 @dataclass(frozen=True)
 class ForegroundOptions:
     """What is known of the background. Lengths without a unit are shares of the object's diameter.
@@ -40,7 +66,8 @@ class ForegroundOptions:
     """
 
     background: Scan | None = None  # the empty bin, in the same frame
-    roi: Box | None = None  # xmin, ymin, zmin, xmax, ymax, zmax in the scene's frame and unit: nothing else is searched
+    # xmin, ymin, zmin, xmax, ymax, zmax in the scene's frame and unit, or a box: nothing else is searched.
+    roi: Box | OrientedBox | None = None
     remove_plane: RemovePlane = "auto"
     background_margin: float = 0.05  # nearer than that to the empty bin is background
     plane_margin: float = 0.03  # nearer than that to the plane belongs to it
@@ -51,7 +78,7 @@ class ForegroundOptions:
     def __post_init__(self) -> None:
         if self.remove_plane not in get_args(RemovePlane):
             raise InputError(f"remove_plane is {self.remove_plane!r}, but must be auto, always or never")
-        if self.roi is not None:
+        if isinstance(self.roi, tuple):
             low, high = self.roi[:3], self.roi[3:]
             if not np.isfinite(self.roi).all() or not all(a < b for a, b in zip(low, high, strict=True)):
                 raise InputError(
@@ -83,9 +110,12 @@ def foreground(
     kept: Bool[np.ndarray, " n"] = np.ones(len(scan.points), dtype=bool)
     warnings: list[str] = []
     if options.roi is not None:
-        low, high = np.array(options.roi[:3]), np.array(options.roi[3:])
         points = placed(pose, scan.points)
-        kept &= ((points >= low) & (points <= high)).all(axis=1)
+        if isinstance(options.roi, OrientedBox):
+            kept &= (np.abs(into(options.roi.T_scene_box, points)) <= options.roi.size / 2).all(axis=1)
+        else:
+            low, high = np.array(options.roi[:3]), np.array(options.roi[3:])
+            kept &= ((points >= low) & (points <= high)).all(axis=1)
         if not kept.any():
             raise InputError(
                 f"the region of interest holds none of the {len(kept)} points: {_box_of(points, scan.unit)}"

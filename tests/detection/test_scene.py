@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from kmn_jax.detection import ForegroundOptions, Scene, make_scene
+from kmn_jax.detection import ForegroundOptions, OrientedBox, Scene, make_scene
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import Camera
 from kmn_jax.io import Scan
@@ -108,6 +109,25 @@ def test_regions_are_in_the_frame_of_the_scan() -> None:
     empty = ForegroundOptions(background=cloud(points[low]), remove_plane="never", background_margin=1e-4)
     left = make_scene(cloud(points), 0.5, sensor=T[:3, 3], background=empty).foreground
     assert abs(left.mean() - (~low).mean()) < 0.01
+
+
+def test_a_region_may_be_turned() -> None:
+    T = pose((5.0, -3.0, 2.0), random_rotations(1, 7)[0])
+    points, size = wall(), np.array([1.5, 1.0, 20.0])
+    wanted = (np.abs(points[:, :2]) <= size[:2] / 2).all(axis=1)
+    assert 0 < wanted.mean() < 1
+    # The box is in line with the axes of a frame in which the scan is not.
+    roi = OrientedBox(T, size)
+    options = ForegroundOptions(roi=roi, remove_plane="never")
+    scene = make_scene(cloud(points @ T[:3, :3].T + T[:3, 3]), 0.5, sensor=T[:3, 3], background=options)
+    assert scene.is_narrowed
+    np.testing.assert_array_equal(scene.foreground, wanted)
+    turn = Rotation.from_matrix(T[:3, :3]).as_rotvec(degrees=True)
+    again = OrientedBox.of_numbers([*T[:3, 3].tolist(), *size.tolist(), *turn.tolist()])
+    np.testing.assert_allclose(again.T_scene_box, T, atol=1e-9)
+    for pose_of_box, sides, match in ((2 * np.eye(4), size, "a rotation"), (T, -size, "above zero")):
+        with pytest.raises(InputError, match=match):
+            OrientedBox(pose_of_box, sides)
 
 
 def test_a_scene_without_foreground_is_refused() -> None:
