@@ -13,6 +13,7 @@ import numpy as np
 import tyro
 
 from kmn_jax.errors import InputError
+from kmn_jax.files import check_output
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -75,8 +76,9 @@ def prepare(
     from kmn_jax.detection import PoseEstimator
     from kmn_jax.objects import save_part
 
+    target = output or source.parent / f"{source.stem}.kmn"
+    check_output(target, source)
     part = PoseEstimator.from_pretrained(weights).prepare(source, _unit(units))
-    target = output or source.with_suffix(".kmn")
     save_part(part, target)
     print(f"{part.name}: {_size(part)}, {_symmetry(part)}; wrote {target}")
 
@@ -102,8 +104,8 @@ def detect(
     if top is not None and top < 1:
         raise InputError(f"top is {top}, but must be at least 1")
     for target in (json, bop_csv, save_picture):
-        if target is not None and not target.parent.is_dir():
-            raise InputError(f"cannot write {target}: its folder does not exist")
+        if target is not None:
+            check_output(target, request.object, request.scene, request.camera, request.background)
     if save_picture is not None:
         from kmn_jax.viz import check_picture
 
@@ -170,6 +172,7 @@ def export(
     """
     from kmn_jax.detection import PoseEstimator, export_estimator
 
+    check_output(output, object)
     estimator = PoseEstimator.from_pretrained(weights)
     part = estimator.prepare(object, _unit(units))
     size = export_estimator(estimator, part, output, points)
@@ -190,6 +193,7 @@ def convert(
     """
     from kmn_jax.models import is_model_file, load_model, load_released, save_model, save_released
 
+    check_output(target, source)
     model = load_model(source) if is_model_file(source) else load_released(source)
     if target.suffix == ".safetensors" and not released_names:
         save_model(model, target)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import secrets
+import stat
 from pathlib import Path
 
 import numpy as np
@@ -13,26 +14,43 @@ from kmn_jax.errors import InputError
 
 
 def write_whole(path: str | Path, content: bytes) -> None:
-    """Write `content` beside `path` and move it there in one step; an existing file is replaced.
+    """Write `content` beside `path` and move it there in one step.
+
+    An existing file is replaced and its mode kept, a link followed; devices and pipes are written to.
 
     Raises:
         InputError: the folder does not exist or cannot be written to.
     """
-    path = Path(path)
+    target = Path(os.path.realpath(path))
     try:
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        mode = target.stat().st_mode if target.exists() else None
+        if mode is not None and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            target.write_bytes(content)
+            return
+        temporary = target.with_name(f".{target.name[:100]}.{secrets.token_hex(8)}")
+        try:
+            temporary.touch(exist_ok=False)  # under the user's umask
+            if mode is not None:
+                temporary.chmod(stat.S_IMODE(mode))
+            temporary.write_bytes(content)
+            temporary.replace(target)
+        finally:
+            temporary.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}") from None
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(content)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from None
-    finally:
-        if os.path.exists(temporary):
-            os.unlink(temporary)
+
+
+def check_output(path: Path, *read: Path | None) -> None:
+    """Raise InputError if a file cannot be written, or is one of those that are `read`."""
+    target = Path(os.path.realpath(path))
+    if not target.parent.is_dir():
+        raise InputError(f"cannot write {path}: its folder does not exist")
+    if target.is_dir():
+        raise InputError(f"cannot write {path}: it is a folder")
+    if not os.access(target if target.exists() and not target.is_file() else target.parent, os.W_OK):
+        raise InputError(f"cannot write {path}: no permission")
+    if any(source is not None and source.exists() and target.exists() and source.samefile(target) for source in read):
+        raise InputError(f"cannot write {path}: it is read, too, and would be lost; name another file")
 
 
 def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:

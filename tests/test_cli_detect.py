@@ -147,6 +147,7 @@ def test_bad_input_is_one_sentence_and_exit_2(
         ({"--save-picture": str(tmp_path / "a.jpg")}, "PNG"),
         ({"--at": "9000,9000,9000"}, "away from the nearest measured point"),
         ({"--json": str(tmp_path / "missing" / "a.json")}, "folder does not exist"),
+        ({"--json": str(cloud)}, "it is read, too"),
         ({"--weights": "large"}, "no released model"),
     ]
     for changes, message in cases:
@@ -158,6 +159,9 @@ def test_bad_input_is_one_sentence_and_exit_2(
         assert error.count("\n") == 1, error
     assert main(["prepare", str(tmp_path / "nothing.stl")]) == 2
     assert main(["prepare", "."]) == 2
+    (tmp_path / "part.stl").write_bytes(MOTOR.read_bytes())
+    assert main(["prepare", str(tmp_path / "part.stl"), "-o", str(tmp_path / "part.stl")]) == 2
+    assert (tmp_path / "part.stl").read_bytes() == MOTOR.read_bytes()
 
 
 def test_a_killed_command_leaves_no_half_written_file(tmp_path: Path) -> None:
