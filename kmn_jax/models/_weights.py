@@ -79,6 +79,11 @@ def load_model(path: str | Path) -> Model:
         for name, target in wanted.items()
         if name in tensors and tensors[name].shape != flat[target].shape
     ]
+    problems += [
+        f"{name} has values that are not finite numbers"
+        for name in wanted
+        if name in tensors and not (tensors[name].dtype.kind in "fV" and np.isfinite(tensors[name]).all())
+    ]
     if problems:
         raise InputError(f"{path} does not fit its own config: {'; '.join(problems[:8])}")
     return Model(

@@ -203,6 +203,12 @@ def _part(tensors: dict[str, np.ndarray], facts: dict[str, object]) -> Part:
     features = array("features", None, None).astype(np.float32)
     if not 1 <= len(features) <= len(points):
         raise ValueError(f"{len(features)} keypoints of {len(points)} points")
+    normals = array("normals", len(points), 3).astype(np.float32)
+    if not np.allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-3):
+        raise ValueError("normals that are not of unit length")
+    minimum, maximum = (array(name, 3).astype(np.float64) for name in ("minimum", "maximum"))
+    if not (minimum <= maximum).all():
+        raise ValueError(f"minimum {minimum.tolist()} above maximum {maximum.tolist()}")
     rotations = array("symmetry_rotations", None, 3, 3).astype(np.float64)
     if not len(rotations):
         raise ValueError("no symmetry, not even the identity")
@@ -214,13 +220,13 @@ def _part(tensors: dict[str, np.ndarray], facts: dict[str, object]) -> Part:
     )
     return Part(
         name=str(facts["name"]),
-        unit=str(facts["unit"]),
+        unit=check_unit(str(facts["unit"])),
         points=points,
-        normals=array("normals", len(points), 3).astype(np.float32),
+        normals=normals,
         features=features,
         diameter=number("diameter"),
-        minimum=array("minimum", 3).astype(np.float64),
-        maximum=array("maximum", 3).astype(np.float64),
+        minimum=minimum,
+        maximum=maximum,
         area=number("area"),
         symmetries=symmetries,
         source_digest=str(facts["source_digest"]),

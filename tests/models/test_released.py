@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 from flax import nnx
+from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from kmn_jax.errors import InputError
@@ -28,6 +29,7 @@ from kmn_jax.models import (
 from kmn_jax.models._released import _read
 from kmn_jax.models._torch_file import read_state_dict, state_dict_bytes
 from tests.golden.make_network import GOLDEN, ROWS, draw_inputs, draw_state_dict
+from tests.reference.networks import TINY
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +58,17 @@ def test_golden_logits_of_the_dense_torch_network(tensors: dict[str, np.ndarray]
         error = np.abs(np.asarray(values)[ROWS] - golden[name]) / golden[f"{name}_range"]
         assert (error < 1e-4).mean() >= 0.995, name
         assert error.max() < 0.02, name
+
+
+def test_weights_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "model.safetensors"
+    save_model(create_model(TINY, jax.random.key(0)), path)
+    with safe_open(str(path), "np") as file:
+        values, header = {name: file.get_tensor(name) for name in file.keys()}, file.metadata()  # noqa: SIM118
+    values[min(values)].reshape(-1)[0] = np.nan
+    save_file(values, path, metadata=header)
+    with pytest.raises(InputError, match=f"{min(values)} has values that are not finite numbers"):
+        load_model(path)
 
 
 def test_names_may_carry_the_data_parallel_prefix(tensors: dict[str, np.ndarray], torch_file: Path, tmp_path) -> None:

@@ -82,9 +82,12 @@ def test_a_card_of_other_weights_is_refused_with_what_renews_it(part: Part, tmp_
     [
         ("points", np.zeros((5, 2), np.float32)),
         ("normals", np.zeros((3, 3), np.float32)),
+        ("normals", np.zeros((256, 3), np.float32)),
         ("features", np.full((8, 8), np.nan, np.float32)),
         ("symmetry_rotations", np.zeros((0, 3, 3))),
         ("minimum", None),
+        ("minimum", np.full(3, 1e6)),
+        ("unit", None),
     ],
 )
 def test_a_damaged_card_is_refused(part: Part, tmp_path: Path, name: str, value: np.ndarray | None) -> None:
@@ -92,7 +95,9 @@ def test_a_damaged_card_is_refused(part: Part, tmp_path: Path, name: str, value:
     save_part(part, path)
     tensors = load_file(path)
     header = {"format": "kmn_jax object card 1", "facts": _facts(path)}
-    if value is None:
+    if name == "unit":
+        header["facts"] = header["facts"].replace('"mm"', '"lm"')
+    elif value is None:
         del tensors[name]
     else:
         tensors[name] = value
