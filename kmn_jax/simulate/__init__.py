@@ -1,6 +1,7 @@
 """Bins of an object's copies: physics, cameras, exact and splatted views, and what a depth sensor makes of them."""
 
-from kmn_jax.simulate._bin_scene import Bin, BinScene
+from kmn_jax.simulate._bin_scene import Bin, BinScene, Fixture
+from kmn_jax.simulate._blocks import block_mesh, container_blocks
 from kmn_jax.simulate._containers import Container, container_surfels, hidden_by_container
 from kmn_jax.simulate._faults import FaultConfig, Faults, displaced, draw_faults, measured
 from kmn_jax.simulate._hulls import CollisionShape, HullConfig, collision_shape
@@ -19,6 +20,7 @@ from kmn_jax.simulate._splat import (
     visible_from_bits,
 )
 from kmn_jax.simulate._views import CameraConfig, place_camera
+from kmn_jax.simulate._world_physics import WorldDrop, rows_of, settle_in
 from kmn_jax.simulate._worlds import World, WorldConfig, make_world
 
 __all__ = [
@@ -35,6 +37,7 @@ __all__ = [
     "DropResult",
     "FaultConfig",
     "Faults",
+    "Fixture",
     "HullConfig",
     "RayMesh",
     "SensorConfig",
@@ -43,8 +46,11 @@ __all__ = [
     "VisiblePoints",
     "World",
     "WorldConfig",
+    "WorldDrop",
     "bin_surfels",
+    "block_mesh",
     "collision_shape",
+    "container_blocks",
     "container_surfels",
     "displaced",
     "draw_faults",
@@ -54,8 +60,10 @@ __all__ = [
     "pack_bits",
     "place_camera",
     "render",
+    "rows_of",
     "sense",
     "settle",
+    "settle_in",
     "visible_bin_surfels",
     "visible_by_splatting",
     "visible_from_bits",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import Camera
@@ -30,13 +30,26 @@ class Bin:
 
 
 @dataclass(frozen=True)
+class Fixture:
+    """A surface that is in a scene beside the copies, such as a container or other parts: a mesh at some poses."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    triangles: Int[np.ndarray, "t 3"]
+    T_bin_fixture: Float[np.ndarray, "k 4 4"]
+
+
+@dataclass(frozen=True)
 class BinScene:
-    """Copies of one object at rest in a bin, seen by one camera. Frames: object, bin, camera."""
+    """Copies of one object at rest in a bin, seen by one camera. Frames: object, bin, camera.
+
+    With fixtures, these are all that is there beside the copies, and the bin is no more than the space they lie in.
+    """
 
     bin: Bin
     T_bin_object: Float[np.ndarray, "n 4 4"]
     camera: Camera
     T_camera_bin: Float[np.ndarray, "4 4"]
+    fixtures: tuple[Fixture, ...] | None = None
 
     @property
     def T_camera_object(self) -> Float[np.ndarray, "n 4 4"]:

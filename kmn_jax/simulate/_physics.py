@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -115,7 +115,7 @@ def settle(shape: CollisionShape, copies: int, config: BinConfig, random_seed: i
     if np.min(random_seed, initial=0) < 0:
         raise InputError(f"random_seed is {random_seed}, but must be 0 or more")
     rng = np.random.default_rng(random_seed)
-    body = _Body(shape)
+    body = Body(shape)
     room = config.packing * config.length * config.width * config.height[0] * shape.diagonal**3
     most = config.scale[1]
     least = min(max(config.scale[0], math.sqrt(copies * shape.volume / room)), most)
@@ -123,11 +123,11 @@ def settle(shape: CollisionShape, copies: int, config: BinConfig, random_seed: i
     for _ in range(config.attempts):
         scale = rng.uniform(least, most)
         size = np.array([config.length * scale, config.width * scale, rng.uniform(*config.height)]) * SIMULATED_DIAGONAL
-        spawned = _spawn(body, copies, size, rng)
+        spawned = spawn([body] * copies, size, rng)
         if spawned is None or copies * body.volume > size.prod():
             rest = _Rest(np.zeros((0, 4, 4)), "the bin is too small for the copies")
         else:
-            rest = _simulate(body, spawned, size, config)
+            rest = _rest_in_bin(body, spawned, size, config)
         if not rest.faults:
             break
         rejected.append(rest.faults)
@@ -145,12 +145,15 @@ def settle(shape: CollisionShape, copies: int, config: BinConfig, random_seed: i
     )
 
 
-class _Body:
-    """The shape as it is simulated: diagonal 0.1 m, centre of mass at the origin, principal axes along the axes."""
+class Body:
+    """A shape as it is simulated: centre of mass at the origin, principal axes along the axes.
 
-    def __init__(self, shape: CollisionShape) -> None:
+    Unless another scale is given, that of the shapes among which it lies, its diagonal is 0.1 m.
+    """
+
+    def __init__(self, shape: CollisionShape, scale: float | None = None) -> None:
         self.shape = shape
-        self.scale = SIMULATED_DIAGONAL / shape.diagonal
+        self.scale = SIMULATED_DIAGONAL / shape.diagonal if scale is None else scale
         self.parts = [(part - shape.center) @ shape.R_object_principal * self.scale for part in shape.parts]
         self.corners = np.concatenate(self.parts)
         self.volume = shape.volume * self.scale**3
@@ -165,15 +168,22 @@ class _Body:
         T_bin_object[:, :3, 3] = T_bin_body[:, :3, 3] / self.scale - rotation @ self.shape.center
         return T_bin_object
 
+    def from_object(self, T_bin_object: np.ndarray) -> np.ndarray:
+        """Return the pose of the simulated body, in metres, of an object at a pose."""
+        T_bin_body = np.eye(4)
+        T_bin_body[:3, :3] = T_bin_object[:3, :3] @ self.shape.R_object_principal
+        T_bin_body[:3, 3] = self.scale * (T_bin_object[:3, :3] @ self.shape.center + T_bin_object[:3, 3])
+        return T_bin_body
 
-def _spawn(body: _Body, copies: int, size: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
-    """Return random poses above the floor, each copy lowered until its box would touch another's; None without room."""
+
+def spawn(bodies: Sequence[Body], size: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
+    """Return random poses above the floor, each body lowered until its box would touch another's; None without room."""
     from scipy.spatial.transform import Rotation
 
     gap = 0.02 * SIMULATED_DIAGONAL
     lows, highs = np.zeros((0, 3)), np.zeros((0, 3))
-    poses = np.tile(np.eye(4), (copies, 1, 1))
-    for pose in poses:
+    poses = np.tile(np.eye(4), (len(bodies), 1, 1))
+    for body, pose in zip(bodies, poses, strict=True):
         for rotation in Rotation.random(20, rng=rng).as_matrix():
             corners = body.corners @ rotation.T
             low, high = corners.min(axis=0) - gap, corners.max(axis=0) + gap
@@ -194,8 +204,8 @@ def _spawn(body: _Body, copies: int, size: np.ndarray, rng: np.random.Generator)
     return poses
 
 
-def _model(body: _Body, copies: int, size: np.ndarray, config: BinConfig) -> Any:
-    """Return the mujoco model: four walls and a floor as planes, one free body a copy."""
+def _model(bodies: Sequence[Body], fixtures: Callable[[Any, dict[str, Any]], None], config: BinConfig) -> Any:
+    """Return the mujoco model: what `fixtures` adds to a specification, and one free body for each of the bodies."""
     import mujoco
 
     spec = mujoco.MjSpec()
@@ -212,6 +222,28 @@ def _model(body: _Body, copies: int, size: np.ndarray, config: BinConfig) -> Any
         "solref": [0.005, 1],
         "solimp": [0.95, 0.99, 0.0005, 0.5, 2],
     }
+    fixtures(spec, contact)
+    kinds = list(dict.fromkeys(bodies))
+    for kind, body in enumerate(kinds):
+        for number, part in enumerate(body.parts):
+            spec.add_mesh(name=f"part{kind}_{number}", uservert=part.ravel())
+    for body in bodies:
+        added = spec.worldbody.add_body(mass=body.mass, inertia=body.inertia, explicitinertial=True)
+        added.add_freejoint()
+        for number in range(len(body.parts)):
+            name = f"part{kinds.index(body)}_{number}"
+            added.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, mass=0, **contact)
+    model = spec.compile()
+    model.dof_damping[:] = np.concatenate(
+        [[*np.full(3, body.mass * config.damping[0]), *(body.inertia * config.damping[1])] for body in bodies]
+    )
+    return model
+
+
+def add_planes(spec: Any, contact: dict[str, Any], size: np.ndarray) -> None:
+    """Add a bin's floor and four walls as planes, the geoms 0 to 4."""
+    import mujoco
+
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     spec.worldbody.add_geom(name="floor", type=plane, size=[1, 1, 1], **contact)
     for number, (x, y) in enumerate(WALLS):
@@ -219,33 +251,42 @@ def _model(body: _Body, copies: int, size: np.ndarray, config: BinConfig) -> Any
         spec.worldbody.add_geom(
             name=f"wall{number}", type=plane, size=[1, 1, 1], pos=position, zaxis=[-x, -y, 0], **contact
         )
-    for number, part in enumerate(body.parts):
-        spec.add_mesh(name=f"part{number}", uservert=part.ravel())
-    for _ in range(copies):
-        added = spec.worldbody.add_body(mass=body.mass, inertia=body.inertia, explicitinertial=True)
-        added.add_freejoint()
-        for number in range(len(body.parts)):
-            added.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"part{number}", mass=0, **contact)
-    model = spec.compile()
-    model.dof_damping[:] = np.tile(
-        np.concatenate([np.full(3, body.mass * config.damping[0]), body.inertia * config.damping[1]]), copies
-    )
-    return model
 
 
-def _simulate(body: _Body, T_bin_body: np.ndarray, size: np.ndarray, config: BinConfig) -> _Rest:
-    """Let the bodies fall until they rest, or the time is over, or mujoco warns."""
+@dataclass(frozen=True)
+class Motion:
+    """Where bodies are when a simulation ends, in simulated metres, and what it says; `fault` is empty if it went well.
+
+    `touching` holds the numbers of the two bodies of each contact, from 1, 0 for what is fixed, and `geoms` of their
+    geoms, fixed ones first.
+    """
+
+    T_world_body: np.ndarray
+    fault: str
+    penetration: float = 0.0
+    capped: bool = False
+    touching: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), dtype=int))
+    geoms: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), dtype=int))
+    places: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # of the contacts
+
+
+def simulate(
+    bodies: Sequence[Body],
+    T_world_body: np.ndarray,
+    fixtures: Callable[[Any, dict[str, Any]], None],
+    config: BinConfig,
+) -> Motion:
+    """Let bodies fall until they rest, or the time is over, or mujoco warns."""
     import mujoco
     from scipy.spatial.transform import Rotation
 
-    copies = len(T_bin_body)
     try:
-        model = _model(body, copies, size, config)
+        model = _model(bodies, fixtures, config)
     except ValueError as error:
-        return _Rest(T_bin_body, f"mujoco refuses the shape: {error}")
+        return Motion(T_world_body, f"mujoco refuses the shape: {error}")
     data = mujoco.MjData(model)
-    quaternions = Rotation.from_matrix(T_bin_body[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
-    data.qpos[:] = np.concatenate([T_bin_body[:, :3, 3], quaternions], axis=1).ravel()
+    quaternions = Rotation.from_matrix(T_world_body[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+    data.qpos[:] = np.concatenate([T_world_body[:, :3, 3], quaternions], axis=1).ravel()
     steps = round(config.check_every / config.step)
     checks, calm = max(1, round(config.time_cap / config.check_every)), 0
     # Lest mujoco writes a log file into the working directory; its warnings are counted in the data.
@@ -258,7 +299,7 @@ def _simulate(body: _Body, T_bin_body: np.ndarray, size: np.ndarray, config: Bin
             mujoco.set_mju_user_warning(previous)
         if data.warning.number.any():
             break
-        speed, rotation = np.linalg.norm(data.qvel.reshape(copies, 2, 3), axis=2).max(axis=0)
+        speed, rotation = np.linalg.norm(data.qvel.reshape(len(bodies), 2, 3), axis=2).max(axis=0)
         still = speed < config.rest_speed * SIMULATED_DIAGONAL and rotation < config.rest_rotation
         calm = calm + 1 if still else 0
         if calm == config.rest_checks:
@@ -266,26 +307,40 @@ def _simulate(body: _Body, T_bin_body: np.ndarray, size: np.ndarray, config: Bin
     warned = np.flatnonzero(data.warning.number)
     if warned.size:
         names = ", ".join(mujoco.mjtWarning(int(kind)).name for kind in warned)
-        return _Rest(T_bin_body, f"the simulation broke down: {names}")
+        return Motion(T_world_body, f"the simulation broke down: {names}")
     mujoco.mj_forward(model, data)  # contacts of the last pose
-    poses = np.tile(np.eye(4), (copies, 1, 1))
+    poses = np.tile(np.eye(4), (len(bodies), 1, 1))
     poses[:, :3, 3] = data.xpos[1:]
-    poses[:, :3, :3] = data.xmat[1:].reshape(copies, 3, 3)
-    penetration = max(0.0, -float(data.contact.dist.min(initial=0.0)))
-    geoms = data.contact.geom
-    touching = model.geom_bodyid[geoms]
-    on_floor = touching[(geoms == 0).any(axis=1)]
-    on_wall = ((geoms > 0) & (geoms <= len(WALLS))).any(axis=1)
-    corners = np.einsum("nij,vj->nvi", poses[:, :3, :3], body.corners) + poses[:, None, :3, 3]
+    poses[:, :3, :3] = data.xmat[1:].reshape(len(bodies), 3, 3)
+    return Motion(
+        poses,
+        "",
+        max(0.0, -float(data.contact.dist.min(initial=0.0))),
+        calm < config.rest_checks,
+        model.geom_bodyid[data.contact.geom],
+        data.contact.geom.copy(),
+        data.contact.pos.copy(),
+    )
+
+
+def _rest_in_bin(body: Body, T_bin_body: np.ndarray, size: np.ndarray, config: BinConfig) -> _Rest:
+    """Let the copies of a body fall into a bin, and judge how they lie."""
+    copies = len(T_bin_body)
+    end = simulate([body] * copies, T_bin_body, lambda spec, contact: add_planes(spec, contact, size), config)
+    if end.fault:
+        return _Rest(T_bin_body, end.fault)
+    on_floor = end.touching[(end.geoms == 0).any(axis=1)]
+    on_wall = ((end.geoms > 0) & (end.geoms <= len(WALLS))).any(axis=1)
+    corners = np.einsum("nij,vj->nvi", end.T_world_body[:, :3, :3], body.corners) + end.T_world_body[:, None, :3, 3]
     beyond = float(max((np.abs(corners[..., :2]) - size[:2] / 2).max(), -corners[..., 2].min()))
     faults, most = [], config.penetration * SIMULATED_DIAGONAL
-    if penetration > most:
-        faults.append(f"copies penetrate by {penetration / SIMULATED_DIAGONAL:.2%} of the diagonal")
+    if end.penetration > most:
+        faults.append(f"copies penetrate by {end.penetration / SIMULATED_DIAGONAL:.2%} of the diagonal")
     if beyond > most:
         faults.append(f"a copy reaches {beyond / SIMULATED_DIAGONAL:.2%} of the diagonal into a wall or the floor")
-    if (data.contact.pos[on_wall, 2] > size[2]).any():
+    if (end.places[on_wall, 2] > size[2]).any():
         faults.append("a copy leans on the wall above the rim")
-    if len(np.unique(touching[touching > 0])) < copies:
+    if len(np.unique(end.touching[end.touching > 0])) < copies:
         faults.append("a copy touches nothing")
     floor_share = len(np.unique(on_floor[on_floor > 0])) / copies
-    return _Rest(poses, ", ".join(faults), penetration, calm < config.rest_checks, floor_share)
+    return _Rest(end.T_world_body, ", ".join(faults), end.penetration, end.capped, floor_share)

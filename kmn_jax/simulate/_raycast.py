@@ -87,9 +87,10 @@ class Rendering:
     """What a camera sees of a scene, in the scene's unit and the camera's frame.
 
     `depth` is z along the optical axis, 0 where nothing was hit; `instances` holds the number of the copy, n for the
-    bin, -1 for nothing; `normals` are those of the triangles, pointing to the camera, zero for nothing. `total_pixels`
-    counts each copy's silhouette without the others and the bin, and `total_boxes` bounds it (left, top, width,
-    height; -1 where it is empty). As in BOP, it reaches beyond the picture, by up to the picture's size on each side.
+    bin and other fixtures, -1 for nothing; `normals` are those of the triangles, pointing to the camera, zero for
+    nothing. `total_pixels` counts each copy's silhouette without anything else, and `total_boxes` bounds it (left, top,
+    width, height; -1 where it is empty). As in BOP, it reaches beyond the picture, by up to the picture's size on each
+    side.
     """
 
     depth: Float[np.ndarray, "h w"]
@@ -133,7 +134,7 @@ def render(mesh: RayMesh, scene: BinScene) -> Rendering:
     instances = np.full((height, width), -1, np.int32)
     normals = np.zeros((height, width, 3), np.float32)
     counts, boxes = np.zeros(total, np.int32), np.full((total, 4), -1, np.int32)
-    bodies = [*((mesh, pose) for pose in poses), (RayMesh(*bin_triangles(scene.bin)), scene.T_camera_bin)]
+    bodies = [*((mesh, pose) for pose in poses), *_fixtures(scene)]
     for number, (body, pose) in enumerate(bodies):
         left, top, right, bottom = _window(body, pose, camera)
         if left >= right or top >= bottom:
@@ -152,7 +153,7 @@ def render(mesh: RayMesh, scene: BinScene) -> Rendering:
         inside = np.s_[first[1] - top : last[1] - top, first[0] - left : last[0] - left]
         nearer = found[inside] < depth[picture]
         depth[picture][nearer] = found[inside][nearer]
-        instances[picture][nearer] = number
+        instances[picture][nearer] = min(number, total)
         normals[picture][nearer] = directions[inside][nearer] @ pose[:3, :3].T.astype(np.float32)
     columns = ((np.arange(width) - camera.cx) / camera.fx).astype(np.float32)
     rows = ((np.arange(height) - camera.cy) / camera.fy).astype(np.float32)
@@ -240,7 +241,9 @@ def _visible(
 def _blocked(
     mesh: RayMesh, scene: BinScene, points: Float[np.ndarray, "k 3"], eye: Float[np.ndarray, "3"]
 ) -> Bool[np.ndarray, " k"]:
-    hidden = RayMesh(*bin_triangles(scene.bin)).blocks(scene.T_camera_bin, points, eye)
+    hidden: Bool[np.ndarray, " k"] = np.zeros(len(points), dtype=bool)
+    for fixture, pose in _fixtures(scene):
+        hidden |= fixture.blocks(pose, points, eye)
     poses = scene.T_camera_object
     rays = points - eye
     distances = np.linalg.norm(rays, axis=1)
@@ -256,6 +259,18 @@ def _blocked(
         tested = np.flatnonzero(near & ~hidden)
         hidden[tested] = mesh.blocks(poses[number], points[tested], eye)
     return hidden
+
+
+def _fixtures(scene: BinScene) -> list[tuple[RayMesh, Float[np.ndarray, "4 4"]]]:
+    """Return what is there beside the copies, with poses in the camera's frame."""
+    if scene.fixtures is None:
+        return [(RayMesh(*bin_triangles(scene.bin)), scene.T_camera_bin)]
+    return [
+        (mesh, scene.T_camera_bin @ pose)
+        for fixture in scene.fixtures
+        for mesh in [RayMesh(fixture.vertices, fixture.triangles)]
+        for pose in fixture.T_bin_fixture
+    ]
 
 
 def _window(body: RayMesh, pose: Float[np.ndarray, "4 4"], camera: Camera) -> tuple[int, int, int, int]:

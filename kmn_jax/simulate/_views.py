@@ -26,6 +26,7 @@ class CameraConfig:
     clearance: float = 1.2  # ... and at least this in diagonals of the bin
     aim: float = 0.1  # how far from the bin's middle that point may be, as a share of its length, width and height
     tilt: float = 20.0  # at most, from the vertical, to any side
+    least_tilt: float = 0.0
     roll: float = 15.0  # at most, either way, from the picture's rows along the bin's length
     fill: tuple[float, float] = (0.85, 0.98)
 
@@ -37,11 +38,17 @@ class CameraConfig:
         if not 0 < self.fill[0] <= self.fill[1] <= 1:
             raise InputError(f"camera config: fill is {self.fill}, but must be a range above 0, up to 1")
         # Within these bounds every camera is above the rim and every corner in front of it.
-        if not 1.1 <= self.clearance < np.inf or not 0 <= self.aim <= 0.25 or not 0 <= self.tilt <= 45:
+        if (
+            not 1.1 <= self.clearance < np.inf
+            or not 0 <= self.aim <= 0.25
+            or not 0 <= self.least_tilt <= self.tilt <= 50
+        ):
             raise InputError(
                 f"camera config: clearance = {self.clearance} must be at least 1.1, aim = {self.aim} between 0 and"
                 f" 0.25, tilt = {self.tilt} between 0 and 45 degrees, or the camera may not see the whole bin"
             )
+        if not 0 <= self.least_tilt <= self.tilt:
+            raise InputError(f"camera config: least_tilt = {self.least_tilt} must be between 0 and tilt = {self.tilt}")
         if not 0 <= self.roll <= 180:
             raise InputError(f"camera config: roll = {self.roll} must be between 0 and 180 degrees")
 
@@ -59,7 +66,7 @@ def place_camera(
     outer = inner + bin.thickness * np.array([2, 2, 1])
     target = rng.uniform(-config.aim, config.aim, 3) * inner + [0, 0, bin.height / 2]
     distance = max(rng.uniform(*config.distance) * diagonal, config.clearance * float(np.linalg.norm(outer)))
-    tilt, roll = np.radians([rng.uniform(0, config.tilt), rng.uniform(-config.roll, config.roll)])
+    tilt, roll = np.radians([rng.uniform(config.least_tilt, config.tilt), rng.uniform(-config.roll, config.roll)])
     side = rng.uniform(0, 2 * np.pi)
     back = np.array([np.sin(tilt) * np.cos(side), np.sin(tilt) * np.sin(side), np.cos(tilt)])
     right = np.array([1.0, 0, 0]) - back[0] * back
