@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,16 +29,14 @@ LEAST_VISIBLE = 0.3  # share of a copy that is seen, from which on it ought to b
 
 
 @dataclass(frozen=True)
-class BinImage:
-    """One image of a bin of one part, in millimetres and the camera's frame."""
+class TrueImage:
+    """What is known of one image of copies of one part, in millimetres and the camera's frame."""
 
     key: FrameKey
     part: Part
-    scene: Scene  # its foreground is what lies inside of the bin
-    inside: Bool[np.ndarray, "h w"]  # the pixels that are measured inside of the bin
+    stranger: Part | None  # a part of about the same size of which there is no copy
     truth: Float[np.ndarray, "i 4 4"]
     visible: Float[np.ndarray, " i"]  # share of each copy that is seen
-    stranger: Part | None = None  # a part of about the same size of which there is no copy
 
     def errors(self, poses: Float[np.ndarray, "s 4 4"]) -> Float[np.ndarray, "s i"]:
         """Return the ADI of poses against each true one, in diameters."""
@@ -48,6 +46,14 @@ class BinImage:
         padded = np.concatenate([pairs, np.tile(np.eye(4), (capacity - len(pairs), 2, 1, 1))]).astype(np.float32)
         found = np.asarray(adi_of_pairs(padded, points))[: len(pairs)]
         return found.reshape(len(poses), len(self.truth)) / self.part.diameter
+
+
+@dataclass(frozen=True)
+class BinImage(TrueImage):
+    """One image of a bin of one part."""
+
+    scene: Scene  # its foreground is what lies inside of the bin
+    inside: Bool[np.ndarray, "h w"]  # the pixels that are measured inside of the bin
 
 
 @jax.jit
@@ -77,19 +83,22 @@ def bin_images(folder: Path, split: str, model: Model, every: int = 1) -> Iterat
         yield BinImage(
             key,
             part,
-            make_scene(_scan(frame), part.diameter, inside=inside[frame.depth > 0]),
-            inside,
+            like_in_size(part, parts.values()),
             np.stack([instance.T_camera_object for instance in instances]),
             np.array([instance.visible_fraction or 0.0 for instance in instances]),
-            min(
-                (other for other_id, other in parts.items() if other_id != object_id),
-                key=lambda other: abs(np.log(other.diameter / part.diameter)),
-                default=None,
-            ),
+            make_scene(scan_of(frame), part.diameter, inside=inside[frame.depth > 0]),
+            inside,
         )
 
 
-def _scan(frame: BopFrame) -> Scan:
+def like_in_size(part: Part, parts: Iterable[Part]) -> Part | None:
+    """Return the other part that is nearest in size, if there is one."""
+    others = (other for other in parts if other is not part)
+    return min(others, key=lambda other: abs(np.log(other.diameter / part.diameter)), default=None)
+
+
+def scan_of(frame: BopFrame) -> Scan:
+    """Return what a camera measured, in millimetres."""
     depth = frame.depth.astype(np.float32)
     return Scan(measured_points(depth, frame.camera), None, depth, frame.camera, _UNIT)
 

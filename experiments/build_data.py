@@ -8,6 +8,8 @@ test-sets    7 electronic and 7 industrial objects in 20 bins each, rendered by 
              digests are compared with those in `assets/test_sets.json`.
 validation-bins  the 50 validation components in 6 bins each, rendered by ray casting, one half as a perfect sensor sees
              them, the other as a structured-light scanner: what the probabilities of detections are fitted on.
+worlds       bins, trays and tables of many kinds (`experiments/worlds.py`), of parts made by parameters: one set to fit
+             probabilities on, one to test on.
 per-object   the pack of one part, for a network of its own: 160 training and 160 validation scenes.
 check        what a pack holds: every file against its checksum, every copy against the walls of its bin.
 small        the few objects and images that the repository carries: `assets/small_pack`, `assets/small_test_set`.
@@ -39,6 +41,7 @@ from experiments.test_sets import (
     validation_sources,
     verdict,
 )
+from experiments.worlds import TEST, VALIDATION, build_worlds
 from kmn_jax.data import Pack, PackConfig, PackedObject, Record, Source, build_pack
 from kmn_jax.errors import InputError
 from kmn_jax.simulate import PERFECT, BinScene, SensorConfig
@@ -101,12 +104,10 @@ class TestSets:
             name: build_test_set(self.folder / name, own, CONFIG, self.sensor, self.workers)
             for name, own in sources.items()
         }
-        if self.record:
-            record_digests(digests)
-        for name, digest in digests.items():
-            print(f"{self.folder / name}: {digest}" + (f": {verdict(name, digest)}" if exact else ""))
-        if exact and any(is_unexplained(name, digest) for name, digest in digests.items()):
-            sys.exit(1)
+        if exact:
+            report_digests(digests, self.record)
+        else:
+            print("\n".join(f"{self.folder / name}: {digest}" for name, digest in digests.items()))
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,22 @@ class ValidationBins:
         sensors = {"perfect": PERFECT, "structured_light": SensorConfig.structured_light()}
         for row, (name, sensor) in enumerate(sensors.items()):
             build_test_set(self.folder / name, sources[row::2], VALIDATION_CONFIG, sensor, self.workers)
+
+
+@dataclass(frozen=True)
+class Worlds:
+    """Build the world bins and compare their digests with the recorded ones."""
+
+    folder: Path = OUTPUTS / "worlds"
+    workers: int | None = None
+    record: bool = False  # write the digests into the repository instead
+
+    def run(self) -> None:
+        recipes = {"validation": VALIDATION, "test": TEST}
+        digests = {
+            f"worlds_{name}": build_worlds(self.folder / name, own, self.workers) for name, own in recipes.items()
+        }
+        report_digests(digests, self.record)
 
 
 @dataclass(frozen=True)
@@ -172,6 +189,16 @@ class Check:
         )
         if problems or outside or not scenes:
             sys.exit(1)
+
+
+def report_digests(digests: dict[str, str], record: bool) -> None:
+    """Print digests with what the repository says of them, or write them into it; exit if one is unexplained."""
+    if record:
+        record_digests(digests)
+    for name, digest in digests.items():
+        print(f"{name}: {digest}: {verdict(name, digest)}")
+    if any(is_unexplained(name, digest) for name, digest in digests.items()):
+        sys.exit(1)
 
 
 def reach_beyond_bin(item: PackedObject, scene: BinScene) -> Float[np.ndarray, " n"]:
@@ -239,6 +266,7 @@ def main() -> None:
                 "electronics": Electronics,
                 "test-sets": TestSets,
                 "validation-bins": ValidationBins,
+                "worlds": Worlds,
                 "per-object": PerObject,
                 "check": Check,
                 "small": Small,

@@ -1,7 +1,8 @@
 """Fit the probabilities of detections: `python -m experiments.calibrate [MODEL.safetensors]`.
 
 Poses are searched in the validation bins (`python -m experiments.build_data validation-bins`), whose objects the
-network was not trained with; in each of them also a part that is not there. A logistic model of the evidence is fitted
+network was not trained with, and in the world bins for validation (`... worlds`), there in the whole scan; in each of
+them also a part that is not there. A logistic model of the evidence is fitted
 to whether they are right. Each object's probabilities are also predicted by a model that was fitted without it, which
 gives the reliability that is printed.
 """
@@ -9,6 +10,8 @@ gives the reliability that is printed.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,10 +21,11 @@ import tyro
 from jaxtyping import Int
 from tqdm import tqdm
 
-from experiments.bins import THRESHOLD, bin_images
+from experiments.bins import THRESHOLD, TrueImage, bin_images
 from experiments.fpfh import fpfh_poses
 from experiments.reliability_picture import save_reliability
 from experiments.test_sets import SPLIT
+from experiments.worlds import world_images
 from kmn_jax.detection import (
     EVIDENCE,
     SIGNS,
@@ -35,6 +39,7 @@ from kmn_jax.detection import (
     device_part,
     expected_calibration_error,
     fit_calibration,
+    make_scene,
     probabilities_bytes,
     refined_candidates,
     reliability,
@@ -58,7 +63,8 @@ class Options:
     model: Annotated[Path | None, tyro.conf.Positional] = None  # .safetensors; the released model unless given
     method: Literal["kmn_jax", "FPFH"] = "kmn_jax"
     bins: Path = Path("outputs/validation_bins")  # folder with datasets in BOP format
-    every: int = 1  # use every so many images
+    worlds: Path | None = Path("outputs/worlds/validation")  # folder of world bins; none: only those of `bins`
+    every: int = 1  # use every so many images of `bins`
     folds: int = 5
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
     output: Path = SHIPPED  # the calibration
@@ -73,23 +79,33 @@ def collect(options: Options) -> dict[str, np.ndarray]:
     config = DetectConfig().search
     config = replace(config, crops=config.crops.of_network(model.config))
     columns: dict[str, list[np.ndarray]] = {"evidence": [], "error": [], "object": [], "refined": []}
+    for number, image, scene in _images(options, model):
+        rows = seeds_over(scene, scene.foreground, image.part)
+        for part in (image.part, image.stranger):
+            if part is None:
+                continue
+            stages = _found_and_refined(options, model, part, scene, rows, config)
+            for refined, found in enumerate(stages):
+                error = image.errors(found.T_camera_object[found.usable]).min(axis=1, initial=np.inf)
+                columns["evidence"].append(found.evidence[found.usable])
+                columns["error"].append(error if part is image.part else np.full_like(error, np.inf))
+                columns["object"].append(np.full(len(error), number))
+                columns["refined"].append(np.full(len(error), bool(refined)))
+    return {name: np.concatenate(parts) for name, parts in columns.items()}
+
+
+def _images(options: Options, model: Model) -> Iterator[tuple[int, TrueImage, Scene]]:
+    """Yield all images with their scenes, and a number that those of one object share."""
     folders = sorted(path for path in options.bins.glob("*") if (path / SPLIT).is_dir())
     if not folders:
         raise InputError(f"{options.bins} holds no datasets: python -m experiments.build_data validation-bins")
-    for number, folder in enumerate(folders):
-        images = bin_images(folder, SPLIT, model, options.every)
-        for image in tqdm(images, unit="image", desc=folder.name):
-            rows = seeds_over(image.scene, image.scene.foreground, image.part)
-            parts = [part for part in (image.part, image.stranger) if part is not None]
-            for part in parts:
-                stages = _found_and_refined(options, model, part, image.scene, rows, config)
-                for refined, found in enumerate(stages):
-                    error = image.errors(found.T_camera_object[found.usable]).min(axis=1, initial=np.inf)
-                    columns["evidence"].append(found.evidence[found.usable])
-                    columns["error"].append(error if part is image.part else np.full_like(error, np.inf))
-                    columns["object"].append(np.full(len(error), 1000 * number + image.key.scene_id))
-                    columns["refined"].append(np.full(len(error), bool(refined)))
-    return {name: np.concatenate(parts) for name, parts in columns.items()}
+    for number, folder in enumerate(folders, start=1):
+        for image in tqdm(bin_images(folder, SPLIT, model, options.every), unit="image", desc=folder.name):
+            yield 1000 * number + image.key.scene_id, image, image.scene
+    if options.worlds is not None:
+        for found in tqdm(world_images(options.worlds, model), unit="image", desc="worlds"):
+            with suppress(InputError):  # a scan without foreground, as of an empty table
+                yield found.object_id, found, make_scene(found.scan, found.part.diameter)
 
 
 def _found_and_refined(

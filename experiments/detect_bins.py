@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from experiments.bins import LEAST_VISIBLE, THRESHOLD, BinImage, bin_images
+from experiments.bins import LEAST_VISIBLE, THRESHOLD, BinImage, TrueImage, bin_images
 from experiments.calibrate import SHIPPED
 from experiments.fpfh import fpfh_poses
 from experiments.reliability_picture import save_reliability
@@ -75,7 +75,7 @@ class Tally:
     copies: int = 0
     seconds: list[float] = field(default_factory=list)
 
-    def add(self, image: BinImage, found: Detections) -> None:
+    def add(self, image: TrueImage, found: Detections) -> None:
         """Count the poses of an image."""
         poses = sorted(found.poses, key=lambda pose: -pose.probability)
         visible = image.visible >= LEAST_VISIBLE
@@ -83,12 +83,12 @@ class Tally:
         errors = image.errors(np.stack([pose.T_scene_object for pose in poses])) if poses else np.zeros((0, 0))
         for pose, error in zip(poses, errors, strict=True):
             free = np.where(taken, np.inf, error)
-            best = int(free.argmin())
-            right = bool(free[best] < THRESHOLD)
+            right = bool(free.min(initial=np.inf) < THRESHOLD)
             self.probability.append(pose.probability)
             self.right.append(right)
-            self.hit.append(right and bool(visible[best]))
-            taken[best] |= right
+            self.hit.append(right and bool(visible[free.argmin()]))
+            if right:
+                taken[free.argmin()] = True
         self.copies += int(visible.sum())
         self.seconds.append(sum(found.timing.stages.values()))
 

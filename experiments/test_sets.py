@@ -112,8 +112,10 @@ def _record() -> dict[str, dict[str, str]]:
 
 
 def record_digests(digests: dict[str, str]) -> None:
-    """Write the digests into the repository, with the versions that they hold for."""
-    DIGESTS.write_text(json.dumps({"made_with": made_with(), "sets": digests}, indent=1) + "\n", encoding="utf-8")
+    """Write digests into the repository, with the versions that they hold for; those of other versions go."""
+    made, record = made_with(), _record()
+    kept = record["sets"] if record["made_with"] == made else {}
+    DIGESTS.write_text(json.dumps({"made_with": made, "sets": kept | digests}, indent=1) + "\n", encoding="utf-8")
 
 
 def made_with() -> dict[str, str]:

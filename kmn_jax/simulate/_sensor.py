@@ -35,6 +35,16 @@ class SensorConfig:
     flank_power: float = 4.0
     flank_patch: float = 0.0  # ... in patches of this radius; 0: pixel by pixel
     projector: tuple[float, float, float] = (0.0, 0.0, 0.0)  # its place in the camera frame: it lights all that is seen
+    disparity_step: float = (
+        0.0  # between depths at `noise_depth` that can be told apart; it grows with the depth squared
+    )
+    shared_noise: float = (
+        0.0  # deviation, at `noise_depth`, of errors that neighbours share; it grows as the noise does
+    )
+    shared_patch: float = 0.1  # how far they share them
+    holes: float = 0.0  # share of the pixels that is missing in patches ...
+    hole_patch: float = 0.1  # ... of this radius
+    flying: float = 0.0  # share of the pixels beside a jump that hang between its two sides
 
     @classmethod
     def structured_light(cls) -> SensorConfig:
@@ -54,14 +64,52 @@ class SensorConfig:
             projector=(1.6, 0.0, 0.0),
         )
 
+    @classmethod
+    def stereo(cls) -> SensorConfig:
+        """Return plausible values for an active stereo camera that sees a part of 50 mm from 400 mm.
+
+        With 640 columns over 65 degrees and cameras 50 mm apart, a twelfth of a pixel of disparity is half a millimetre
+        there; errors come from matching windows of some pixels, and so neighbours share them.
+        """
+        return cls(
+            noise=0.004,
+            disparity_step=0.01,
+            shared_noise=0.008,
+            shared_patch=0.12,
+            edge_width=2,
+            edge_loss=0.5,
+            holes=0.03,
+            hole_patch=0.1,
+            flank_loss=0.7,
+            flank_patch=0.05,
+            projector=(1.0, 0.0, 0.0),
+        )
+
+    @classmethod
+    def time_of_flight(cls) -> SensorConfig:
+        """Return plausible values for a time-of-flight camera that sees a part of 50 mm from 400 mm.
+
+        Data sheets of such cameras state deviations of millimetres at half a metre, and systematic errors as large;
+        pixels at edges see both sides of them, and measure something between.
+        """
+        return cls(
+            noise=0.03,
+            shared_noise=0.02,
+            shared_patch=0.5,
+            edge_width=2,
+            edge_loss=0.1,
+            flying=0.5,
+            max_slant=80.0,
+        )
+
     def __post_init__(self) -> None:
-        for name in ("noise", "step", "flank_patch", "edge_width"):
+        for name in ("noise", "step", "flank_patch", "edge_width", "disparity_step", "shared_noise"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise InputError(f"sensor config: {name} is {getattr(self, name)}, but must be zero or above")
-        for name in ("noise_depth", "edge_jump", "flank_power"):
+        for name in ("noise_depth", "edge_jump", "flank_power", "shared_patch", "hole_patch"):
             if not 0 < getattr(self, name) < np.inf:
                 raise InputError(f"sensor config: {name} is {getattr(self, name)}, but must be above zero")
-        for name in ("slant_noise", "edge_loss", "flank_loss"):
+        for name in ("slant_noise", "edge_loss", "flank_loss", "holes", "flying"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(f"sensor config: {name} is {getattr(self, name)}, but must be between 0 and 1")
         if not 0 < self.max_slant <= 90:
@@ -87,7 +135,7 @@ def sense(
             f"the rendering has {rendering.depth.shape[1]} x {rendering.depth.shape[0]} pixels, but the scene's camera"
             f" {camera.width} x {camera.height}: render this scene"
         )
-    noise_rng, edge_rng, flank_rng = rng.spawn(3)
+    noise_rng, edge_rng, flank_rng, shared_rng, hole_rng, flying_rng = rng.spawn(6)
     exact, normals = rendering.depth, rendering.normals
     if not exact.any():
         return np.zeros_like(exact)
@@ -97,23 +145,34 @@ def sense(
     missing = exact <= 0
     if config.max_slant < 90:
         missing |= cosine < np.cos(np.radians(config.max_slant))
+    edges = _near_jumps(exact, config.edge_jump * diagonal, config.edge_width) if config.edge_width else missing
     if config.edge_width and config.edge_loss > 0:
-        edges = _near_jumps(exact, config.edge_jump * diagonal, config.edge_width)
         missing |= edges & (edge_rng.random(exact.shape, dtype=np.float32) < config.edge_loss)
+    pixels = diagonal * camera.fx / float(np.median(exact[exact > 0]))  # that a diagonal is wide
     if config.flank_loss > 0:
-        radius = config.flank_patch * diagonal * camera.fx / float(np.median(exact[exact > 0]))
         missing |= (
-            _uniform_field(exact.shape, radius, flank_rng)
+            _uniform_field(exact.shape, config.flank_patch * pixels, flank_rng)
             < config.flank_loss * np.clip(1 - cosine, 0, 1) ** config.flank_power
         )
+    if config.holes > 0:
+        missing |= _uniform_field(exact.shape, config.hole_patch * pixels, hole_rng) < config.holes
     if any(config.projector):
         hit = exact > 0
         missing[hit] |= hidden_from(mesh, scene, points[hit], normals[hit], diagonal * np.array(config.projector))
-    depth = exact
+    depth, farther = exact, (exact / (config.noise_depth * diagonal)) ** 2 * diagonal
+    if config.flying > 0:
+        depth = _flying(exact, edges, config, flying_rng)
     if config.noise > 0:
         growth = 1 + config.slant_noise * (1 / np.maximum(cosine, _LEAST_COSINE) - 1)
-        deviation = config.noise * diagonal * (exact / (config.noise_depth * diagonal)) ** 2 * growth
-        depth = exact + deviation * noise_rng.standard_normal(exact.shape, dtype=np.float32)
+        depth = depth + config.noise * farther * growth * noise_rng.standard_normal(exact.shape, dtype=np.float32)
+    if config.shared_noise > 0:
+        field = _normal_field(exact.shape, config.shared_patch * pixels, shared_rng)
+        depth = depth + config.shared_noise * farther * field
+    if config.disparity_step > 0:
+        # Equal steps of 1 / depth.
+        steps = (config.noise_depth * diagonal) ** 2 / (config.disparity_step * diagonal)
+        disparity = np.round(steps / np.where(depth > 0, depth, np.inf))
+        depth = np.where(disparity > 0, steps / np.maximum(disparity, 1), 0)
     if config.step > 0:
         step = config.step * diagonal
         depth = step * np.round(depth.astype(np.float64) / step)
@@ -134,13 +193,33 @@ def _near_jumps(depth: Float[np.ndarray, "h w"], jump: float, width: int) -> Boo
     return maximum_filter(near, size=2 * width - 1)
 
 
+def _flying(
+    exact: Float[np.ndarray, "h w"], edges: Bool[np.ndarray, "h w"], config: SensorConfig, rng: np.random.Generator
+) -> Float[np.ndarray, "h w"]:
+    """Return the depth where some of the pixels beside a jump hang between its two sides."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    size = 2 * config.edge_width + 1
+    far = maximum_filter(exact, size)
+    near = minimum_filter(np.where(exact > 0, exact, exact.max()), size)
+    chosen = edges & (exact > 0) & (rng.random(exact.shape, dtype=np.float32) < config.flying)
+    between = near + rng.random(exact.shape, dtype=np.float32) * (far - near)
+    return np.where(chosen, between, exact).astype(np.float32)
+
+
 def _uniform_field(shape: tuple[int, ...], radius: float, rng: np.random.Generator) -> Float[np.ndarray, "h w"]:
     """Return numbers that are uniform in [0, 1] at every pixel and alike within about `radius` pixels."""
-    from scipy.ndimage import gaussian_filter
     from scipy.special import ndtr
 
-    if radius < 1:
-        return rng.random(shape, dtype=np.float32)
+    return rng.random(shape, dtype=np.float32) if radius < 1 else ndtr(_normal_field(shape, radius, rng))
+
+
+def _normal_field(shape: tuple[int, ...], radius: float, rng: np.random.Generator) -> Float[np.ndarray, "h w"]:
+    """Return standard normal numbers that are alike within about `radius` pixels."""
+    from scipy.ndimage import gaussian_filter
+
     white = rng.standard_normal(shape, dtype=np.float32)
+    if radius < 1:
+        return white
     # White noise that is blurred so has this variance; wrapping around keeps it the same up to the borders.
-    return ndtr(gaussian_filter(white, radius, mode="wrap") * np.float32(2 * np.pi**0.5 * radius))
+    return gaussian_filter(white, radius, mode="wrap") * np.float32(2 * np.pi**0.5 * radius)

@@ -198,6 +198,57 @@ def test_faults_do_not_depend_on_each_other() -> None:
     np.testing.assert_array_equal(together[together > 0], noisy[together > 0])
 
 
+@pytest.mark.parametrize("distance", [8.0, 16.0])
+def test_steps_of_disparity_grow_with_the_depth_squared(distance: float) -> None:
+    case = plane(distance, slant=45)
+    depth = sense(*case, SensorConfig(disparity_step=0.01), generator())
+    expected = 0.01 * (distance / 8) ** 2
+    levels = np.unique(depth)
+    np.testing.assert_allclose(np.diff(levels), expected, rtol=0.1)
+    assert np.abs(depth - case[2].depth).max() <= 0.55 * expected
+
+
+def test_shared_errors_are_shared_by_neighbours_alone() -> None:
+    case = plane(8.0)
+    error = sense(*case, SensorConfig(shared_noise=0.01, shared_patch=0.004), generator()) - case[2].depth
+    np.testing.assert_allclose(error.std(), 0.01, rtol=0.25)
+    beside, far = (np.corrcoef(error[:, step:].ravel(), error[:, :-step].ravel())[0, 1] for step in (1, 30))
+    assert beside > 0.9
+    assert abs(far) < 0.3
+
+
+def test_holes_are_patches_of_their_share() -> None:
+    case = plane(8.0)
+    missing = sense(*case, SensorConfig(holes=0.2, hole_patch=0.003), generator()) == 0
+    np.testing.assert_allclose(missing.mean(), 0.2, atol=0.06)
+    assert (missing[:, 1:] == missing[:, :-1]).mean() > 0.9
+
+
+def test_flying_pixels_hang_between_the_sides_of_a_jump() -> None:
+    mesh, scene, rendering = two_plates(0.5)
+    config = SensorConfig(flying=0.5, edge_width=2, edge_loss=0.0)
+    depth = sense(mesh, scene, rendering, config, generator())[40:160, 40:160]
+    changed = depth != rendering.depth[40:160, 40:160]
+    assert 0.4 < changed[:, 58:62].mean() < 0.6
+    assert not changed[:, :56].any()
+    assert not changed[:, 64:].any()
+    assert ((depth[changed] >= 8 - 1e-5) & (depth[changed] <= 8.5 + 1e-5)).all()
+
+
+@pytest.mark.parametrize("config", [SensorConfig.stereo(), SensorConfig.time_of_flight()], ids=["stereo", "flight"])
+def test_other_families_are_deterministic_and_leave_most_of_what_faces_them(config: SensorConfig) -> None:
+    mesh, camera = RayMesh(*bracket()), Camera(500.0, 500.0, 199.5, 149.5, 400, 300)
+    scene = pile(6, camera)
+    rendering = render(mesh, scene)
+    depth = sense(mesh, scene, rendering, config, generator(1))
+    np.testing.assert_array_equal(depth, sense(mesh, scene, rendering, config, generator(1)))
+    facing = (rendering.depth > 0) & (-rendering.normals[..., 2] > 0.8)
+    kept = facing & (depth > 0)
+    assert 0.6 * facing.sum() < kept.sum() < facing.sum()
+    error = np.abs(depth - rendering.depth)[kept]
+    assert 0.002 * mesh.diagonal < np.median(error) < 0.06 * mesh.diagonal
+
+
 def test_a_structured_light_scanner_is_deterministic_and_leaves_most_of_what_faces_it() -> None:
     mesh, camera = RayMesh(*bracket()), Camera(500.0, 500.0, 199.5, 149.5, 400, 300)
     scene = pile(6, camera)

@@ -1,0 +1,150 @@
+"""Detection in world bins, see `experiments/worlds.py`: `python -m experiments.detect_worlds`.
+
+The whole scan is given and nothing else. A pose is right if its ADI to a copy is below a tenth of the diameter and no
+more probable pose took that copy; recall counts the copies of which at least 30% is visible. In images without the
+part, and with `--strangers` for a part of about the same size in all images, whatever is accepted is wrong.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from experiments.bins import LEAST_VISIBLE
+from experiments.calibrate import SHIPPED
+from experiments.detect_bins import CONFIG, Tally
+from experiments.reliability_picture import save_reliability
+from experiments.worlds import WorldImage, world_images
+from kmn_jax.detection import (
+    EVIDENCE,
+    Detections,
+    Probabilities,
+    Timing,
+    detect,
+    load_probabilities,
+    make_scene,
+    reliability,
+)
+from kmn_jax.errors import InputError
+from kmn_jax.io import Scan
+from kmn_jax.models import Model, load_model, load_pretrained
+from kmn_jax.objects import Part
+from kmn_jax.report import check_target, print_table, write_json
+
+_CERTAIN = 0.9
+_ALL = "all"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to detect by what."""
+
+    folder: Path = Path("outputs/worlds/test")
+    model: Path | None = None  # .safetensors; the released model unless given
+    calibration: Path = SHIPPED
+    every: int = 1  # use every so many images
+    strangers: bool = False  # also search all images for a part that is not there
+    json: Path | None = None
+    picture: Path | None = None  # .png file for the reliability diagram
+
+
+@dataclass
+class WorldTally:
+    """Counts over the images of a family of worlds."""
+
+    found: Tally = field(default_factory=Tally)
+    first_right: list[bool] = field(default_factory=list)  # of images with a visible copy
+    absent: int = 0  # images that were searched for a part that is not there, ...
+    wrong_where_absent: int = 0  # ... and what was accepted in them
+
+    def add(self, image: WorldImage, found: Detections) -> None:
+        """Count the poses of an image."""
+        before = len(self.found.right)
+        self.found.add(image, found)
+        if not len(image.truth):
+            self._add_absent(found)
+        elif (image.visible >= LEAST_VISIBLE).any():
+            # They are counted from the most probable one on.
+            self.first_right.append(bool(found.poses) and self.found.right[before])
+
+    def add_stranger(self, found: Detections) -> None:
+        """Count the poses of a part that is not there."""
+        self.found.probability += [pose.probability for pose in found.poses]
+        self.found.right += [False] * len(found.poses)
+        self.found.hit += [False] * len(found.poses)
+        self._add_absent(found)
+
+    def _add_absent(self, found: Detections) -> None:
+        self.absent += 1
+        self.wrong_where_absent += sum(pose.probability >= CONFIG.accepted for pose in found.poses)
+
+    def row(self, name: str) -> dict[str, Any]:
+        """Return the numbers."""
+        row = self.found.row(name, "kmn_jax", CONFIG.accepted)
+        del row["method"]
+        probability, right = np.array(self.found.probability), np.array(self.found.right, dtype=bool)
+        certain = probability >= _CERTAIN
+        return row | {
+            "first right": float(np.mean(self.first_right)) if self.first_right else None,
+            f"right from {_CERTAIN} on": float(right[certain].mean()) if certain.any() else None,
+            "searched in vain": self.absent,
+            "accepted there": self.wrong_where_absent,
+        }
+
+
+def run(options: Options) -> dict[str, Any]:
+    """Detect, print and return the numbers."""
+    for target in (options.json, options.picture):
+        check_target(target)
+    model = load_pretrained() if options.model is None else load_model(options.model)
+    fitted = load_probabilities(options.calibration, EVIDENCE)
+    tallies: dict[str, WorldTally] = defaultdict(WorldTally)
+    for image in tqdm(world_images(options.folder, model, options.every), unit="image"):
+        found = _found(model, fitted, image.part, image.scan)
+        for name in (image.family, _ALL):
+            tallies[name].add(image, found)
+        if options.strangers and image.stranger is not None and len(image.truth):
+            found = _found(model, fitted, image.stranger, image.scan)
+            for name in (image.family, _ALL):
+                tallies[name].add_stranger(found)
+    if not tallies:
+        raise InputError(f"{options.folder} holds no images")
+    rows = [tally.row(name) for name, tally in tallies.items()]
+    print_table("Detection in world bins", rows)
+    curves = {
+        name: [
+            {"probability": mean, "share right": share, "poses": count}
+            for mean, share, count in reliability(
+                np.array(tally.found.probability), np.array(tally.found.right, dtype=bool)
+            )
+        ]
+        for name, tally in tallies.items()
+    }
+    print_table("Reliability over all", curves[_ALL])
+    results = {"detection": rows, "reliability": curves}
+    write_json(options.json, results)
+    save_reliability({_ALL: curves[_ALL]}, options.picture)
+    return results
+
+
+def _found(model: Model, fitted: Probabilities, part: Part, scan: Scan) -> Detections:
+    """Return what is found in a whole scan; nothing where it is refused, as one that shows a plane alone."""
+    try:
+        scene = make_scene(scan, part.diameter)
+    except InputError as error:
+        return Detections(part.name, scan.unit, (), Timing({}, 0.0), str(error), ())
+    return detect(model, fitted, part, scene, 0, CONFIG)
+
+
+if __name__ == "__main__":
+    try:
+        run(tyro.cli(Options))
+    except InputError as problem:
+        sys.exit(f"error: {problem}")

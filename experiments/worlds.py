@@ -1,0 +1,333 @@
+"""World bins: scenes of many kinds under physics, to fit probabilities on and to test on, as BOP datasets.
+
+Validation and test differ in random seeds, in the families of parts (`experiments.parametric_parts`) and in the ranges
+of containers. Each family of worlds is one scene of the dataset, `worlds.json` names them; of each scene's images some
+show no copy of the part that is asked for, but other parts or nothing. `test_targets_bop19.json` says which part is
+asked for in which image, with the number of its copies; other parts have no entries in scene_gt.json.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.bins import TrueImage, like_in_size, scan_of
+from experiments.parametric_parts import TEST_FAMILIES, VALIDATION_FAMILIES, write_parts
+from kmn_jax.bop import (
+    BopDataset,
+    BopFrame,
+    dataset_digest,
+    finest_depth_scale,
+    write_camera,
+    write_models,
+    write_scene,
+)
+from kmn_jax.data import load_models, one_thread_a_process, rendered_frame
+from kmn_jax.errors import InputError
+from kmn_jax.files import write_whole
+from kmn_jax.io import Scan
+from kmn_jax.models import Model
+from kmn_jax.objects import ObjectConfig, ObjectModel, load_object, make_part
+from kmn_jax.simulate import (
+    PERFECT,
+    Bin,
+    BinConfig,
+    BinScene,
+    CameraConfig,
+    CollisionShape,
+    Container,
+    Fixture,
+    RayMesh,
+    SensorConfig,
+    block_mesh,
+    collision_shape,
+    container_blocks,
+    place_camera,
+    rows_of,
+    settle_in,
+)
+
+SPLIT = "test"
+NAMES, TARGETS = "worlds.json", "test_targets_bop19.json"
+_PARTS_A_FAMILY = 2
+_ABSENT = 4  # of so many images one shows no copy of the part that is asked for
+_KINDS = 3  # of other parts in an image, those of about the size of the one that is asked for
+_TRIES = 6  # of an image's container, until parts come to rest in it
+_PHYSICS = BinConfig(time_cap=3.0, penetration=0.01, attempts=3)
+
+
+@dataclass(frozen=True)
+class WorldImage(TrueImage):
+    """One image of a world; the part is the one that is asked for, and there may be no copy of it."""
+
+    family: str
+    object_id: int  # of the part
+    scan: Scan
+
+
+@dataclass(frozen=True)
+class Family:
+    """One kind of world. Lengths are in diagonals of the part that is asked for, unless they are in millimetres."""
+
+    name: str
+    half: tuple[float, float] = (0.9, 1.8)  # of the floor's length and width
+    height: tuple[float, float] = (0.5, 1.2)  # of the walls; 0: a table
+    slope: tuple[float, float] = (0.0, 0.0)
+    rim: tuple[float, float] = (0.03, 0.06)
+    lift: tuple[float, float] = (0.03, 0.06)
+    divider: float = 0.0  # share of the images with one
+    neighbour: float = 0.0  # share of the images with a second bin in view
+    copies: tuple[int, int] = (3, 14)
+    others: tuple[int, int] = (0, 0)  # parts of other kinds
+    rows: bool = False  # parts side by side, in a container that just holds them
+    distance: tuple[float, float] = (6.0, 10.0)
+    tilt: tuple[float, float] = (0.0, 20.0)  # degrees
+    fill: tuple[float, float] = (0.75, 0.95)
+    sensor: Literal["perfect", "structured_light", "stereo", "time_of_flight"] = "structured_light"
+
+
+FAMILIES = (
+    Family("plain bin", sensor="perfect"),
+    Family("thick rims", rim=(0.15, 0.6), lift=(0.1, 0.3)),
+    Family("tilted walls", slope=(0.2, 0.5), height=(0.4, 0.9)),
+    Family("oblique camera", tilt=(30.0, 45.0)),
+    Family("table", height=(0.0, 0.0), copies=(1, 7)),
+    Family("tray", height=(0.08, 0.3), copies=(2, 9), rim=(0.03, 0.2)),
+    Family("dividers and neighbours", divider=0.8, neighbour=0.6, half=(1.2, 2.0)),
+    Family("mixed parts", others=(3, 9), copies=(2, 6)),
+    Family("deep pile", half=(0.6, 0.9), height=(1.2, 2.0), copies=(14, 22)),
+    Family("far camera", distance=(15.0, 28.0), fill=(0.6, 0.75)),
+    Family("active stereo", sensor="stereo"),
+    Family("time of flight", sensor="time_of_flight"),
+    Family("touching rows", rows=True, height=(0.1, 0.4), copies=(4, 12)),
+)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What makes a set of world bins."""
+
+    random_seed: int
+    parts: tuple[str, ...]  # families of them
+    wider: float  # by which factor the ranges of containers are moved, so that no two sets share them
+    images: int = 8  # of each family
+
+
+VALIDATION = Recipe(11, VALIDATION_FAMILIES, 1.0)
+TEST = Recipe(12, TEST_FAMILIES, 1.15)
+
+
+def build_worlds(folder: Path, recipe: Recipe, workers: int | None = None) -> str:
+    """Write world bins, but for scenes that exist, and return their digest.
+
+    Raises InputError if the folder cannot be written to or holds bins of another recipe.
+    """
+    from tqdm import tqdm
+
+    text = json.dumps({"recipe": asdict(recipe), "families": [asdict(family) for family in FAMILIES]}, indent=1) + "\n"
+    file = folder / ".recipe.json"
+    if (folder / SPLIT).exists() and (not file.exists() or file.read_text(encoding="utf-8") != text):
+        raise InputError(f"{folder} holds bins of another recipe: choose another folder, or delete it")
+    write_whole(file, text.encode())
+    paths = write_parts(folder / ".parts", recipe.parts, _PARTS_A_FAMILY, recipe.random_seed)
+    missing = [number for number in range(len(FAMILIES)) if not (folder / SPLIT / f"{number + 1:06d}").exists()]
+    one_thread_a_process()
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        made = [pool.submit(_write_family, folder, recipe, paths, number) for number in missing]
+        for future in tqdm(as_completed(made), total=len(made), unit="family", desc=folder.name):
+            future.result()
+        models = pool.map(_model, paths)
+        write_models(folder, dict(enumerate(models, start=1)))
+    targets = [
+        entry
+        for number in range(len(FAMILIES))
+        for entry in json.loads((folder / f".targets_{number}.json").read_text(encoding="utf-8"))
+    ]
+    write_whole(folder / TARGETS, (json.dumps(targets, indent=1) + "\n").encode())
+    names = {str(number): family.name for number, family in enumerate(FAMILIES, start=1)}
+    write_whole(folder / NAMES, (json.dumps(names, indent=1) + "\n").encode())
+    frame = BopDataset(folder, SPLIT)[0]
+    write_camera(folder, frame.camera, finest_depth_scale(float(frame.depth.max()), "mm"))
+    return dataset_digest(folder)
+
+
+def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldImage]:
+    """Yield every so many images. Raises InputError if the folder holds no world bins."""
+    try:
+        targets = json.loads((folder / TARGETS).read_text(encoding="utf-8"))
+        names = json.loads((folder / NAMES).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{folder} holds no world bins ({error}): python -m experiments.build_data worlds") from None
+    dataset = BopDataset(folder, SPLIT, unit="mm")
+    models, problems = load_models(dataset, ObjectConfig(num_points=4096))
+    if problems:
+        raise InputError(f"{folder}: {problems[0]}")
+    parts = {object_id: make_part(found, model) for object_id, found in models.items()}
+    keys = {(key.scene_id, key.image_id): key for key in dataset.keys}
+    for target in targets[::every]:
+        key, part = keys[target["scene_id"], target["im_id"]], parts[target["obj_id"]]
+        frame = dataset.frame(*key, masks=True).with_visibility()
+        instances = frame.instances or ()
+        yield WorldImage(
+            key,
+            part,
+            like_in_size(part, parts.values()),
+            np.array([instance.T_camera_object for instance in instances]).reshape(-1, 4, 4),
+            np.array([instance.visible_fraction or 0.0 for instance in instances]),
+            names[str(key.scene_id)],
+            target["obj_id"],
+            scan_of(frame),
+        )
+
+
+def _model(path: Path) -> ObjectModel:
+    return load_object(path, unit="mm").in_unit("m")
+
+
+def _write_family(folder: Path, recipe: Recipe, paths: list[Path], number: int) -> None:
+    """Write the images of a family of worlds, and which part is asked for in each."""
+    family = FAMILIES[number]
+    rng = np.random.default_rng((recipe.random_seed, number))
+    models: dict[int, tuple[ObjectModel, CollisionShape]] = {}
+
+    def loaded(row: int) -> tuple[ObjectModel, CollisionShape]:
+        if row not in models:
+            model = _model(paths[row])
+            models[row] = model, collision_shape(model.vertices, model.triangles)
+        return models[row]
+
+    frames: list[BopFrame] = []
+    targets = []
+    rows = rng.permutation(len(paths))
+    for image in range(recipe.images):
+        row = int(rows[image % len(rows)])
+        size = loaded(row)[1].diagonal
+        alike = sorted(range(len(paths)), key=lambda other: abs(np.log(loaded(other)[1].diagonal / size)))
+        others = [other for other in alike if other != row][:_KINDS]
+        absent = image % _ABSENT == _ABSENT - 1
+        frame = next(
+            filter(None, (_image(family, recipe, loaded, row, others, absent, rng) for _ in range(_TRIES))), None
+        )
+        if frame is None:
+            raise InputError(f"{family.name}: {paths[row].stem} comes to rest in none of {_TRIES} containers")
+        instances = tuple(replace(instance, object_id=row + 1) for instance in frame.instances or ())
+        frames.append(replace(frame, instances=instances))
+        targets.append({"im_id": image, "inst_count": len(instances), "obj_id": row + 1, "scene_id": number + 1})
+    write_whole(folder / f".targets_{number}.json", json.dumps(targets).encode())
+    farthest = max(float(frame.depth.max()) for frame in frames)
+    write_scene(folder, SPLIT, number + 1, frames, "m", finest_depth_scale(farthest, "m"))
+
+
+def _image(
+    family: Family,
+    recipe: Recipe,
+    loaded: Callable[[int], tuple[ObjectModel, CollisionShape]],
+    row: int,
+    others: list[int],
+    absent: bool,
+    rng: np.random.Generator,
+) -> BopFrame | None:
+    """Return one image of a family of worlds; None if parts did not come to rest."""
+    model, shape = loaded(row)
+    copies = 0 if absent else int(rng.integers(family.copies[0], family.copies[1] + 1))
+    most = family.others if not absent else (family.others if family.others[1] else (0, family.copies[1] // 2))
+    foreign = [others[k] for k in rng.integers(0, len(others), int(rng.integers(most[0], most[1] + 1)))]
+    container, starts = _container(family, recipe, rng), None
+    kinds = [row] * copies + foreign
+    if family.rows and copies:
+        grid = (max(1, round(copies**0.5)), max(1, copies // max(1, round(copies**0.5))))
+        starts, half = rows_of(shape, grid, _PHYSICS, int(rng.integers(1 << 31)))
+        container, kinds = container._replace(half=jnp.asarray(half + 0.02, dtype=jnp.float32)), [row] * len(starts)
+        copies = len(starts)
+    poses, inside = np.zeros((0, 4, 4)), np.zeros(0, dtype=bool)
+    if kinds:
+        # Lengths of the container are in diagonals of the part that is asked for, of the first one in physics.
+        ratio = shape.diagonal / loaded(kinds[0])[1].diagonal
+        drop = settle_in(
+            [loaded(kind)[1] for kind in kinds],
+            _scaled(container, ratio),
+            _PHYSICS,
+            int(rng.integers(1 << 31)),
+            starts,
+        )
+        if drop.fault:
+            return None
+        poses, inside = drop.T_world_object, drop.inside
+    own = inside[:copies]
+    if copies and not own.any():
+        return None
+    vertices, triangles = block_mesh([block * shape.diagonal for block in container_blocks(container)])
+    fixtures = [Fixture(vertices, triangles, np.eye(4)[None])]
+    for kind in dict.fromkeys(kinds[copies:]):
+        chosen = [number for number in range(copies, len(kinds)) if kinds[number] == kind and inside[number]]
+        fixtures.append(Fixture(loaded(kind)[0].vertices, loaded(kind)[0].triangles, poses[chosen].reshape(-1, 4, 4)))
+    opening = np.asarray(container.opening if float(container.height) else container.half, dtype=float)
+    length, width = (2 * opening * shape.diagonal).tolist()
+    bin = Bin(length, width, max(float(container.height), 0.1) * shape.diagonal, float(container.rim) * shape.diagonal)
+    cameras = CameraConfig(
+        width=1280,
+        height=960,
+        distance=family.distance,
+        tilt=family.tilt[1],
+        least_tilt=family.tilt[0],
+        roll=180.0,
+        fill=family.fill,
+    )
+    camera, T_camera_bin = place_camera(bin, shape.diagonal, cameras, rng)
+    scene = BinScene(bin, poses[:copies][own].reshape(-1, 4, 4), camera, T_camera_bin, tuple(fixtures))
+    sensor = _sensor(family, shape.diagonal, rng)
+    frame = rendered_frame(RayMesh(model.vertices, model.triangles), scene, 1, sensor, rng.spawn(1)[0])
+    return replace(frame, bin=None, T_camera_bin=None)
+
+
+def _container(family: Family, recipe: Recipe, rng: np.random.Generator) -> Container:
+    """Draw a container, in diagonals."""
+
+    def draw(low: float, high: float) -> float:
+        return float(rng.uniform(low, high)) * recipe.wider
+
+    half = np.array([draw(*family.half), draw(*family.half)])
+    height, walls = draw(*family.height), np.zeros(2)
+    divided, neighbour = rng.random() < family.divider, rng.random() < family.neighbour
+    if divided:
+        walls[int(rng.integers(2))] = height * rng.uniform(0.3, 0.8)
+    values = {
+        "half": half,
+        "height": height,
+        "slope": draw(*family.slope),
+        "rim": draw(*family.rim),
+        "lift": draw(*family.lift) if height else 0.0,
+        "divider": half * rng.uniform(-0.5, 0.5, 2),
+        "divider_height": walls,
+        "divider_width": rng.uniform(0.03, 0.12),
+        "gap": rng.uniform(0.05, 0.4) if neighbour else np.inf,
+    }
+    return Container(**{name: jnp.asarray(value, dtype=jnp.float32) for name, value in values.items()})
+
+
+def _scaled(container: Container, factor: float) -> Container:
+    """Return a container whose lengths are multiplied; its slope is none."""
+    scaled = Container(*(value * jnp.float32(factor) for value in container))
+    return scaled._replace(slope=container.slope)
+
+
+def _sensor(family: Family, diagonal: float, rng: np.random.Generator) -> SensorConfig:
+    """Draw a sensor of the family's kind for a part of a diagonal, in metres."""
+    strength = rng.uniform(0.5, 1.5)
+    if family.sensor == "perfect":
+        return PERFECT
+    if family.sensor == "structured_light":
+        return replace(SensorConfig.structured_light(), noise=strength * 1.5e-4 / diagonal)
+    if family.sensor == "stereo":
+        stereo = SensorConfig.stereo()
+        return replace(stereo, noise=strength * stereo.noise, shared_noise=strength * stereo.shared_noise)
+    flight, millimetres = SensorConfig.time_of_flight(), strength * 0.05 / diagonal
+    return replace(flight, noise=millimetres * flight.noise, shared_noise=millimetres * flight.shared_noise)
