@@ -136,6 +136,10 @@ def build_worlds(folder: Path, recipe: Recipe, workers: int | None = None) -> st
     file = folder / ".recipe.json"
     if (folder / SPLIT).exists() and (not file.exists() or file.read_text(encoding="utf-8") != text):
         raise InputError(f"{folder} holds bins of another recipe: choose another folder, or delete it")
+    try:
+        (folder / ".parts").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be written to: {error.strerror}") from None
     write_whole(file, text.encode())
     paths = write_parts(folder / ".parts", recipe.parts, _PARTS_A_FAMILY, recipe.random_seed)
     missing = [number for number in range(len(FAMILIES)) if not (folder / SPLIT / f"{number + 1:06d}").exists()]
