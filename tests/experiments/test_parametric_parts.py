@@ -1,0 +1,50 @@
+"""Parts made by parameters: closed solids of the right size, each draw another one, the same bytes each time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.parametric_parts import FAMILIES, TEST_FAMILIES, VALIDATION_FAMILIES, write_parts
+from kmn_jax.objects import load_object
+from kmn_jax.simulate import collision_shape
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_solids_are_closed_and_wound_outwards(family: str) -> None:
+    extents = []
+    for number in range(5):
+        vertices, triangles = FAMILIES[family](np.random.default_rng(number))
+        assert np.isfinite(vertices).all()
+        edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+        forward = set(map(tuple, edges.tolist()))
+        assert len(forward) == len(edges)
+        assert {(b, a) for a, b in forward} == forward
+        corners = vertices[triangles]
+        assert np.linalg.det(corners).sum() > 0  # six times the volume
+        extents.append(np.ptp(vertices, axis=0))
+        assert 20 <= extents[-1].max() <= 125
+    assert len(np.unique(np.round(extents, 3), axis=0)) == len(extents)
+
+
+@pytest.mark.parametrize("family", ["washer", "hex_nut", "flanged_tube", "elbow"])
+def test_bores_go_through(family: str) -> None:
+    _, triangles = FAMILIES[family](np.random.default_rng(0))
+    edges = {tuple(sorted(pair)) for t in triangles.tolist() for pair in zip(t, [*t[1:], t[0]], strict=True)}
+    assert len(np.unique(triangles)) - len(edges) + len(triangles) == 0
+
+
+def test_no_family_is_in_both_sets() -> None:
+    assert not set(VALIDATION_FAMILIES) & set(TEST_FAMILIES)
+    assert {*VALIDATION_FAMILIES, *TEST_FAMILIES} == set(FAMILIES)
+
+
+def test_files_repeat_and_become_objects(tmp_path: Path) -> None:
+    first = write_parts(tmp_path, ["mug", "washer"], 1, 3)
+    contents = [path.read_bytes() for path in first]
+    assert [path.read_bytes() for path in write_parts(tmp_path, ["mug", "washer"], 1, 3)] == contents
+    for path in first:
+        model = load_object(path, unit="mm")
+        assert collision_shape(model.vertices, model.triangles).volume > 0

@@ -1,0 +1,110 @@
+"""World bins: what is asked for where, and how what is found there is counted."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import worlds
+from experiments.detect_worlds import WorldTally
+from experiments.worlds import FAMILIES, VALIDATION, WorldImage, build_worlds, world_images
+from kmn_jax.bop import BopDataset
+from kmn_jax.detection import CropPrediction, Detection, Detections, Timing
+from kmn_jax.errors import InputError
+from kmn_jax.models import Model, load_pretrained
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return load_pretrained()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two families, of two parts, in this process."""
+    folder = tmp_path_factory.mktemp("worlds")
+    recipe = replace(VALIDATION, parts=("washer",), images=4)
+    families = {family.name: family for family in FAMILIES}
+    chosen = (
+        replace(families["mixed parts"], sensor="perfect", others=(1, 2), copies=(1, 2)),
+        replace(families["touching rows"], sensor="perfect", copies=(4, 4)),
+    )
+    patch = pytest.MonkeyPatch()
+    with patch.context() as change:
+        change.setattr(worlds, "FAMILIES", chosen)
+        change.setattr(worlds, "ProcessPoolExecutor", _InThisProcess)
+        build_worlds(folder, recipe)
+        with pytest.raises(InputError, match="another recipe"):
+            build_worlds(folder, replace(recipe, images=5))
+    return folder
+
+
+class _InThisProcess:
+    def __init__(self, workers: int | None, mp_context: object) -> None:
+        from concurrent.futures import ThreadPoolExecutor
+
+        self._pool = ThreadPoolExecutor(1)
+
+    def __enter__(self) -> object:
+        return self._pool
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown()
+
+
+def test_a_quarter_of_the_images_lack_the_part(folder: Path) -> None:
+    targets = json.loads((folder / worlds.TARGETS).read_text())
+    assert len(targets) == 8
+    dataset = BopDataset(folder, worlds.SPLIT, unit="mm")
+    assert not dataset.problems()
+    for target in targets:
+        frame = dataset.frame(target["scene_id"], target["im_id"])
+        assert {instance.object_id for instance in frame.instances or ()} <= {target["obj_id"]}
+        assert len(frame.instances or ()) == target["inst_count"]
+        assert (target["inst_count"] == 0) == (target["im_id"] == 3)
+        assert (frame.depth > 0).mean() > 0.5
+
+
+def test_parts_in_rows_touch_nothing_but_each_other(folder: Path) -> None:
+    frame = BopDataset(folder, worlds.SPLIT, unit="mm").frame(2, 0)
+    heights = np.array([instance.T_camera_object[:3, 3] for instance in frame.instances or ()])
+    assert len(heights) == 4
+    apart = np.linalg.norm(heights[:, None] - heights[None], axis=2)[~np.eye(4, dtype=bool)].reshape(4, 3)
+    np.testing.assert_allclose(apart.min(axis=1), apart.min(), rtol=0.05)
+
+
+def test_images_come_with_their_scans(folder: Path, model: Model) -> None:
+    images = list(world_images(folder, model))
+    assert [image.family for image in images] == ["mixed parts"] * 4 + ["touching rows"] * 4
+    first = images[0]
+    assert first.stranger is not None
+    assert first.stranger is not first.part
+    assert len(first.scan.points) == (first.scan.depth > 0).sum()  # type: ignore[operator]
+    assert first.errors(first.truth).argmin(axis=1).tolist() == list(range(len(first.truth)))
+    with pytest.raises(InputError, match="build_data worlds"):
+        next(world_images(folder / "models", model))
+
+
+def test_counts(folder: Path, model: Model) -> None:
+    present, *_, absent = list(world_images(folder, model))[:4]
+    assert not len(absent.truth)
+
+    def found(image: WorldImage, poses: list[np.ndarray], probability: float) -> Detections:
+        nothing = CropPrediction(np.zeros((0, 3), np.float32), np.zeros(0, bool), np.zeros(0, int))
+        made = [Detection(pose, probability, 9, 1.0, 0.5, 1.0, 0.0, 0.0, 0.0, np.zeros(3), nothing) for pose in poses]
+        return Detections(image.part.name, "mm", tuple(made), Timing({"search": 1.0}, 0.0))
+
+    tally = WorldTally()
+    beside = present.truth[0] + np.array([[0, 0, 0, 1000.0]] * 3 + [[0] * 4])
+    tally.add(present, found(present, [present.truth[0], beside], 0.95))
+    tally.add(absent, found(absent, [np.eye(4)], 0.7))
+    tally.add_stranger(found(present, [np.eye(4)], 0.2))
+    row = tally.row("these")
+    assert row["precision"] == pytest.approx(1 / 3)
+    assert row["first right"] == 1
+    assert row["right from 0.9 on"] == 0.5
+    assert (row["searched in vain"], row["accepted there"]) == (2, 1)
