@@ -119,6 +119,7 @@ class Recipe:
     parts: tuple[str, ...]  # families of them
     wider: float  # by which factor the ranges of containers are moved, so that no two sets share them
     images: int = 8  # of each family
+    size: tuple[int, int] = (1280, 960)  # of an image, in pixels
 
 
 VALIDATION = Recipe(11, VALIDATION_FAMILIES, 1.0)
@@ -277,8 +278,7 @@ def _image(
     length, width = (2 * opening * shape.diagonal).tolist()
     bin = Bin(length, width, max(float(container.height), 0.1) * shape.diagonal, float(container.rim) * shape.diagonal)
     cameras = CameraConfig(
-        width=1280,
-        height=960,
+        *recipe.size,
         distance=family.distance,
         tilt=family.tilt[1],
         least_tilt=family.tilt[0],

@@ -27,7 +27,7 @@ def model() -> Model:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two families, of two parts, in this process."""
     folder = tmp_path_factory.mktemp("worlds")
-    recipe = replace(VALIDATION, parts=("washer",), images=4)
+    recipe = replace(VALIDATION, parts=("washer",), images=4, size=(320, 240))
     families = {family.name: family for family in FAMILIES}
     chosen = (
         replace(families["mixed parts"], sensor="perfect", others=(1, 2), copies=(1, 2)),
