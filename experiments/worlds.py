@@ -117,7 +117,7 @@ class Recipe:
 
     random_seed: int
     parts: tuple[str, ...]  # families of them
-    wider: float  # by which factor the ranges of containers are moved, so that no two sets share them
+    wider: float  # by which factor the ranges of containers are moved, so that sets differ in them
     images: int = 8  # of each family
     size: tuple[int, int] = (1280, 960)  # of an image, in pixels
 
@@ -184,13 +184,18 @@ def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldIm
         yield WorldImage(
             key,
             part,
-            like_in_size(part, parts.values()),
+            like_in_size(part, [other for other in parts.values() if kind_of(other.name) != kind_of(part.name)]),
             np.array([instance.T_camera_object for instance in instances]).reshape(-1, 4, 4),
             np.array([instance.visible_fraction or 0.0 for instance in instances]),
             names[str(key.scene_id)],
             target["obj_id"],
             scan_of(frame),
         )
+
+
+def kind_of(name: str) -> str:
+    """Return the family of a part: parts of one family may be too alike to be called others."""
+    return name.rpartition("_")[0]
 
 
 def _model(path: Path) -> ObjectModel:
@@ -216,7 +221,7 @@ def _write_family(folder: Path, recipe: Recipe, paths: list[Path], number: int) 
         row = int(rows[image % len(rows)])
         size = loaded(row)[1].diagonal
         alike = sorted(range(len(paths)), key=lambda other: abs(np.log(loaded(other)[1].diagonal / size)))
-        others = [other for other in alike if other != row][:_KINDS]
+        others = [other for other in alike if kind_of(paths[other].stem) != kind_of(paths[row].stem)][:_KINDS]
         absent = image % _ABSENT == _ABSENT - 1
         frame = next(
             filter(None, (_image(family, recipe, loaded, row, others, absent, rng) for _ in range(_TRIES))), None
