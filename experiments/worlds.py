@@ -176,19 +176,21 @@ def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldIm
     if problems:
         raise InputError(f"{folder}: {problems[0]}")
     parts = {object_id: make_part(found, model) for object_id, found in models.items()}
+    kinds = {object_id: kind_of(dataset.model(object_id).name or "") for object_id in parts}
     keys = {(key.scene_id, key.image_id): key for key in dataset.keys}
     for target in targets[::every]:
-        key, part = keys[target["scene_id"], target["im_id"]], parts[target["obj_id"]]
+        key, object_id = keys[target["scene_id"], target["im_id"]], target["obj_id"]
+        part = parts[object_id]
         frame = dataset.frame(*key, masks=True).with_visibility()
         instances = frame.instances or ()
         yield WorldImage(
             key,
             part,
-            like_in_size(part, [other for other in parts.values() if kind_of(other.name) != kind_of(part.name)]),
+            like_in_size(part, [other for number, other in parts.items() if kinds[number] != kinds[object_id]]),
             np.array([instance.T_camera_object for instance in instances]).reshape(-1, 4, 4),
             np.array([instance.visible_fraction or 0.0 for instance in instances]),
             names[str(key.scene_id)],
-            target["obj_id"],
+            object_id,
             scan_of(frame),
         )
 

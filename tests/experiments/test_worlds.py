@@ -82,7 +82,9 @@ def test_images_come_with_their_scans(folder: Path, model: Model) -> None:
     assert [image.family for image in images] == ["mixed parts"] * 4 + ["touching rows"] * 4
     first = images[0]
     assert first.stranger is not None
-    assert {kind_of(part.name) for part in (first.part, first.stranger)} == {"washer", "lever"}
+    names = json.loads((folder / "models" / "object_names.json").read_text())
+    numbers = [str(int(part.name.removeprefix("obj_"))) for part in (first.part, first.stranger)]
+    assert {kind_of(names[number]) for number in numbers} == {"washer", "lever"}
     assert len(first.scan.points) == (first.scan.depth > 0).sum()  # type: ignore[operator]
     assert first.errors(first.truth).argmin(axis=1).tolist() == list(range(len(first.truth)))
     with pytest.raises(InputError, match="build_data worlds"):
