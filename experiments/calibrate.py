@@ -1,10 +1,9 @@
 """Fit the probabilities of detections: `python -m experiments.calibrate [MODEL.safetensors]`.
 
 Poses are searched in the validation bins (`python -m experiments.build_data validation-bins`), whose objects the
-network was not trained with, and in the world bins for validation (`... worlds`), there in the whole scan; in each of
-them also a part that is not there. A logistic model of the evidence is fitted
-to whether they are right. Each object's probabilities are also predicted by a model that was fitted without it, which
-gives the reliability that is printed.
+network was not trained with, and with `--worlds` in the whole scans of world bins (`... worlds`); in each of them also a
+part that is not there. A logistic model of the evidence is fitted to whether they are right. Each object's
+probabilities are also predicted by a model that was fitted without it, which gives the reliability that is printed.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ class Options:
     model: Annotated[Path | None, tyro.conf.Positional] = None  # .safetensors; the released model unless given
     method: Literal["kmn_jax", "FPFH"] = "kmn_jax"
     bins: Path = Path("outputs/validation_bins")  # folder with datasets in BOP format
-    worlds: Path | None = Path("outputs/worlds/validation")  # folder of world bins; none: only those of `bins`
+    worlds: Path | None = None  # folder of world bins to fit on, too: outputs/worlds/validation
     every: int = 1  # use every so many images of `bins`
     folds: int = 5
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part

@@ -90,9 +90,12 @@ def _claim(folder: Path, config: PackConfig, sensor: SensorConfig) -> None:
 
 
 def verdict(name: str, digest: str) -> str:
-    """Say how a test set's digest compares with the one that the repository holds."""
+    """Say how a set's digest compares with the one that the repository holds."""
     record = _record()
-    if record["sets"].get(name) == digest:
+    recorded = record["sets"].get(name)
+    if recorded is None:
+        return f"{DIGESTS.name} has no digest to compare it with"
+    if recorded == digest:
         return "as recorded"
     differing = {key: value for key, value in made_with().items() if record["made_with"].get(key) != value}
     reason = f"made with others ({differing})" if differing else "with the same versions: please report it"
@@ -101,7 +104,8 @@ def verdict(name: str, digest: str) -> str:
 
 def is_unexplained(name: str, digest: str) -> bool:
     """Tell whether a digest differs from the recorded one though the versions are the same."""
-    return _record()["sets"].get(name) != digest and _record()["made_with"] == made_with()
+    record = _record()
+    return record["sets"].get(name, digest) != digest and record["made_with"] == made_with()
 
 
 def _record() -> dict[str, dict[str, str]]:

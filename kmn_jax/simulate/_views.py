@@ -38,11 +38,7 @@ class CameraConfig:
         if not 0 < self.fill[0] <= self.fill[1] <= 1:
             raise InputError(f"camera config: fill is {self.fill}, but must be a range above 0, up to 1")
         # Within these bounds every camera is above the rim and every corner in front of it.
-        if (
-            not 1.1 <= self.clearance < np.inf
-            or not 0 <= self.aim <= 0.25
-            or not 0 <= self.least_tilt <= self.tilt <= 50
-        ):
+        if not 1.1 <= self.clearance < np.inf or not 0 <= self.aim <= 0.25 or not 0 <= self.tilt <= 45:
             raise InputError(
                 f"camera config: clearance = {self.clearance} must be at least 1.1, aim = {self.aim} between 0 and"
                 f" 0.25, tilt = {self.tilt} between 0 and 45 degrees, or the camera may not see the whole bin"

@@ -186,6 +186,8 @@ def test_digests_of_the_test_sets_are_recorded_with_what_made_them() -> None:
     assert len(test_sets.industrial_sources()) == 7
     assert test_sets.is_unexplained("electronics", "0" * 64) == (record["made_with"] == test_sets.made_with())
     assert "differs from test_sets.json" in test_sets.verdict("electronics", "0" * 64)
+    assert not test_sets.is_unexplained("unheard of", "0" * 64)
+    assert "no digest" in test_sets.verdict("unheard of", "0" * 64)
     if record["made_with"] == test_sets.made_with():
         assert test_sets.verdict("electronics", record["sets"]["electronics"]) == "as recorded"
 

@@ -64,6 +64,9 @@ def test_distance_tilt_and_roll_follow_the_config() -> None:
     rolls = np.degrees(np.arctan2(lengthways[:, 1], lengthways[:, 0]))
     assert -15 <= rolls.min() < -14
     assert 14 < rolls.max() <= 15
+    oblique = replace(config, tilt=45.0, least_tilt=30.0)
+    steep = np.degrees([np.arccos(-place_camera(bin, 1.0, oblique, rng)[1][2, 2]) for _ in range(200)])
+    assert 30 <= steep.min() < 31 < 44 < steep.max() <= 45
     # Cameras stand on all sides of the bin.
     np.testing.assert_array_less(np.abs(positions[:, :2].mean(axis=0)), 0.3)
     assert (np.ptp(positions[:, :2], axis=0) > 4).all()
@@ -98,6 +101,9 @@ def test_the_unit_does_not_matter_and_generators_decide() -> None:
         {"clearance": 1.0},
         {"aim": 0.3},
         {"tilt": 60.0},
+        {"tilt": 46.0},
+        {"least_tilt": 21.0},
+        {"least_tilt": -1.0},
         {"roll": float("nan")},
     ],
     ids=lambda wrong: next(iter(wrong)),
