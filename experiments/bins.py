@@ -1,8 +1,9 @@
-"""Bins of a BOP dataset with ground truth, as scenes to search; and whether what was found there is right."""
+"""Images of BOP datasets with ground truth, bins and worlds, and whether what was found there is right."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import json
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from kmn_jax.bop import BopDataset, BopFrame, FrameKey
+from experiments.test_sets import SPLIT
+from experiments.worlds import NAMES, TARGETS, kind_of
+from kmn_jax.bop import BopDataset, BopFrame, BopInstance, FrameKey
 from kmn_jax.data import load_models
 from kmn_jax.detection import Scene, bin_content, make_scene
 from kmn_jax.errors import InputError
@@ -56,6 +59,15 @@ class BinImage(TrueImage):
     inside: Bool[np.ndarray, "h w"]  # the pixels that are measured inside of the bin
 
 
+@dataclass(frozen=True)
+class WorldImage(TrueImage):
+    """One image of a world; the part is the one that is asked for, and there may be no copy of it."""
+
+    family: str
+    object_id: int  # of the part
+    scan: Scan
+
+
 @jax.jit
 def adi_of_pairs(pairs: jax.Array, points: jax.Array) -> jax.Array:
     """Return the ADI of pairs of poses (p, 2, 4, 4), the second one the true one, of an object's points (m, 3)."""
@@ -67,11 +79,7 @@ def bin_images(folder: Path, split: str, model: Model, every: int = 1) -> Iterat
 
     Raises InputError if the folder is no such dataset.
     """
-    dataset = BopDataset(folder, split, unit=_UNIT)
-    models, problems = load_models(dataset, ObjectConfig(num_points=4096))
-    if problems:
-        raise InputError(f"{folder}: {problems[0]}")
-    parts = {object_id: make_part(found, model) for object_id, found in models.items()}
+    dataset, parts = _opened(folder, split, model)
     for key in dataset.keys[::every]:
         frame = dataset.frame(*key, masks=True).with_visibility()
         instances = frame.instances or ()
@@ -83,22 +91,60 @@ def bin_images(folder: Path, split: str, model: Model, every: int = 1) -> Iterat
         yield BinImage(
             key,
             part,
-            like_in_size(part, parts.values()),
-            np.stack([instance.T_camera_object for instance in instances]),
-            np.array([instance.visible_fraction or 0.0 for instance in instances]),
-            make_scene(scan_of(frame), part.diameter, inside=inside[frame.depth > 0]),
+            _like_in_size(part, parts.values()),
+            *_truth(instances),
+            make_scene(_scan(frame), part.diameter, inside=inside[frame.depth > 0]),
             inside,
         )
 
 
-def like_in_size(part: Part, parts: Iterable[Part]) -> Part | None:
+def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldImage]:
+    """Yield every so many images. Raises InputError if the folder holds no world bins."""
+    try:
+        targets = json.loads((folder / TARGETS).read_text(encoding="utf-8"))
+        names = json.loads((folder / NAMES).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{folder} holds no world bins ({error}): python -m experiments.build_data worlds") from None
+    dataset, parts = _opened(folder, SPLIT, model)
+    kinds = {object_id: kind_of(dataset.model(object_id).name or "") for object_id in parts}
+    keys = {(key.scene_id, key.image_id): key for key in dataset.keys}
+    for target in targets[::every]:
+        key, object_id = keys[target["scene_id"], target["im_id"]], target["obj_id"]
+        part = parts[object_id]
+        frame = dataset.frame(*key, masks=True).with_visibility()
+        yield WorldImage(
+            key,
+            part,
+            _like_in_size(part, [other for number, other in parts.items() if kinds[number] != kinds[object_id]]),
+            *_truth(frame.instances or ()),
+            names[str(key.scene_id)],
+            object_id,
+            _scan(frame),
+        )
+
+
+def _opened(folder: Path, split: str, model: Model) -> tuple[BopDataset, dict[int, Part]]:
+    """Return a dataset and its parts. Raises InputError if one cannot be used."""
+    dataset = BopDataset(folder, split, unit=_UNIT)
+    models, problems = load_models(dataset, ObjectConfig(num_points=4096))
+    if problems:
+        raise InputError(f"{folder}: {problems[0]}")
+    return dataset, {object_id: make_part(found, model) for object_id, found in models.items()}
+
+
+def _truth(instances: Sequence[BopInstance]) -> tuple[Float[np.ndarray, "i 4 4"], Float[np.ndarray, " i"]]:
+    """Return the poses of copies, and which share of each is seen."""
+    poses = np.array([instance.T_camera_object for instance in instances]).reshape(-1, 4, 4)
+    return poses, np.array([instance.visible_fraction or 0.0 for instance in instances])
+
+
+def _like_in_size(part: Part, parts: Iterable[Part]) -> Part | None:
     """Return the other part that is nearest in size, if there is one."""
     others = (other for other in parts if other is not part)
     return min(others, key=lambda other: abs(np.log(other.diameter / part.diameter)), default=None)
 
 
-def scan_of(frame: BopFrame) -> Scan:
-    """Return what a camera measured, in millimetres."""
+def _scan(frame: BopFrame) -> Scan:
     depth = frame.depth.astype(np.float32)
     return Scan(measured_points(depth, frame.camera), None, depth, frame.camera, _UNIT)
 

@@ -1,9 +1,9 @@
 """Fit the probabilities of detections: `python -m experiments.calibrate [MODEL.safetensors]`.
 
 Poses are searched in the validation bins (`python -m experiments.build_data validation-bins`), whose objects the
-network was not trained with, and with `--worlds` in the whole scans of world bins (`... worlds`); in each of them also a
-part that is not there. A logistic model of the evidence is fitted to whether they are right. Each object's
-probabilities are also predicted by a model that was fitted without it, which gives the reliability that is printed.
+network was not trained with, and with `--worlds` in the whole scans of world bins; in each of them also a part that is
+not there. A logistic model of the evidence is fitted to whether they are right. Each object's probabilities are also
+predicted by a model that was fitted without it, which gives the reliability that is printed.
 """
 
 from __future__ import annotations
@@ -20,11 +20,10 @@ import tyro
 from jaxtyping import Int
 from tqdm import tqdm
 
-from experiments.bins import THRESHOLD, TrueImage, bin_images
+from experiments.bins import THRESHOLD, TrueImage, bin_images, world_images
 from experiments.fpfh import fpfh_poses
-from experiments.reliability_picture import save_reliability
+from experiments.reliability_picture import reliability_table, save_reliability
 from experiments.test_sets import SPLIT
-from experiments.worlds import world_images
 from kmn_jax.detection import (
     EVIDENCE,
     SIGNS,
@@ -41,7 +40,6 @@ from kmn_jax.detection import (
     make_scene,
     probabilities_bytes,
     refined_candidates,
-    reliability,
     search_at,
     seeds_over,
 )
@@ -148,10 +146,7 @@ def fit(
         "right among accepted where the part is": float(right[present].mean()) if present.any() else None,
         "accepted among right": float(accepted[right].mean()),
     }
-    table = [
-        {"probability": mean, "share right": share, "poses": count}
-        for mean, share, count in reliability(held_out, right)
-    ]
+    table = reliability_table(held_out, right)
     slopes = dict(zip(EVIDENCE, model.weights, strict=True)) | {"bias": model.bias}
     return model, {"summary": summary, "reliability": table, "weights": slopes}
 

@@ -23,7 +23,7 @@ from tqdm import tqdm
 from experiments.bins import LEAST_VISIBLE, THRESHOLD, BinImage, TrueImage, bin_images
 from experiments.calibrate import SHIPPED
 from experiments.fpfh import fpfh_poses
-from experiments.reliability_picture import save_reliability
+from experiments.reliability_picture import reliability_table, save_reliability
 from experiments.test_sets import SPLIT
 from kmn_jax.detection import (
     EVIDENCE,
@@ -40,7 +40,6 @@ from kmn_jax.detection import (
     explore,
     load_probabilities,
     refined_candidates,
-    reliability,
 )
 from kmn_jax.errors import InputError
 from kmn_jax.models import Model, load_model, load_pretrained
@@ -75,8 +74,10 @@ class Tally:
     copies: int = 0
     seconds: list[float] = field(default_factory=list)
 
-    def add(self, image: TrueImage, found: Detections) -> None:
-        """Count the poses of an image."""
+    @classmethod
+    def of(cls, image: TrueImage, found: Detections) -> Tally:
+        """Count the poses of an image, from the most probable one on."""
+        tally = cls()
         poses = sorted(found.poses, key=lambda pose: -pose.probability)
         visible = image.visible >= LEAST_VISIBLE
         taken = np.zeros(len(image.truth), dtype=bool)
@@ -84,13 +85,22 @@ class Tally:
         for pose, error in zip(poses, errors, strict=True):
             free = np.where(taken, np.inf, error)
             right = bool(free.min(initial=np.inf) < THRESHOLD)
-            self.probability.append(pose.probability)
-            self.right.append(right)
-            self.hit.append(right and bool(visible[free.argmin()]))
+            tally.probability.append(pose.probability)
+            tally.right.append(right)
+            tally.hit.append(right and bool(visible[free.argmin()]))
             if right:
                 taken[free.argmin()] = True
-        self.copies += int(visible.sum())
-        self.seconds.append(sum(found.timing.stages.values()))
+        tally.copies += int(visible.sum())
+        tally.seconds.append(sum(found.timing.stages.values()))
+        return tally
+
+    def extend(self, other: Tally) -> None:
+        """Count what another one counted."""
+        self.probability += other.probability
+        self.right += other.right
+        self.hit += other.hit
+        self.copies += other.copies
+        self.seconds += other.seconds
 
     def row(self, name: str, method: str, accepted: float) -> dict[str, Any]:
         """Return the numbers."""
@@ -130,8 +140,9 @@ def run(options: Options) -> dict[str, Any]:
         for image in tqdm(bin_images(folder, SPLIT, model, options.every), unit="image", desc=folder.name):
             for name in options.methods:
                 found = _found(name, model, fitted[name], image)
+                counted = Tally.of(image, found)
                 for group in (folder.name, f"{folder.name}: {image.part.name}"):
-                    tallies[group, name].add(image, found)
+                    tallies[group, name].extend(counted)
     rows = [tally.row(*key, CONFIG.accepted) for key, tally in tallies.items()]
     total = [row for row in rows if ":" not in row["bins"]]
     print_table("Whole-bin detection", total)
@@ -141,10 +152,7 @@ def run(options: Options) -> dict[str, Any]:
         parts = [tallies[folder.name, name] for folder in options.sets]
         probability = np.concatenate([tally.probability for tally in parts])
         right = np.concatenate([tally.right for tally in parts]).astype(bool)
-        curves[name] = [
-            {"probability": mean, "share right": share, "poses": count}
-            for mean, share, count in reliability(probability, right)
-        ]
+        curves[name] = reliability_table(probability, right)
         print_table(f"Reliability of {name}", curves[name])
     results = {"detection": rows, "reliability": curves}
     write_json(options.json, results)

@@ -17,11 +17,10 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from experiments.bins import LEAST_VISIBLE
+from experiments.bins import LEAST_VISIBLE, WorldImage, world_images
 from experiments.calibrate import SHIPPED
 from experiments.detect_bins import CONFIG, Tally
-from experiments.reliability_picture import save_reliability
-from experiments.worlds import WorldImage, world_images
+from experiments.reliability_picture import reliability_table, save_reliability
 from kmn_jax.detection import (
     EVIDENCE,
     Detections,
@@ -30,7 +29,6 @@ from kmn_jax.detection import (
     detect,
     load_probabilities,
     make_scene,
-    reliability,
 )
 from kmn_jax.errors import InputError
 from kmn_jax.io import Scan
@@ -64,26 +62,24 @@ class WorldTally:
     absent: int = 0  # images that were searched for a part that is not there, ...
     wrong_where_absent: int = 0  # ... and what was accepted in them
 
-    def add(self, image: WorldImage, found: Detections) -> None:
-        """Count the poses of an image."""
-        before = len(self.found.right)
-        self.found.add(image, found)
+    def add(self, image: WorldImage, found: Tally) -> None:
+        """Count the poses of the part that an image was made for."""
+        self.found.extend(found)
         if not len(image.truth):
             self._add_absent(found)
         elif (image.visible >= LEAST_VISIBLE).any():
-            # They are counted from the most probable one on.
-            self.first_right.append(bool(found.poses) and self.found.right[before])
+            self.first_right.append(any(found.right[:1]))
 
     def add_stranger(self, found: Detections) -> None:
         """Count the poses of a part that is not there."""
-        self.found.probability += [pose.probability for pose in found.poses]
-        self.found.right += [False] * len(found.poses)
-        self.found.hit += [False] * len(found.poses)
-        self._add_absent(found)
+        wrong = [pose.probability for pose in found.poses]
+        counted = Tally(wrong, [False] * len(wrong), [False] * len(wrong))
+        self.found.extend(counted)
+        self._add_absent(counted)
 
-    def _add_absent(self, found: Detections) -> None:
+    def _add_absent(self, found: Tally) -> None:
         self.absent += 1
-        self.wrong_where_absent += sum(pose.probability >= CONFIG.accepted for pose in found.poses)
+        self.wrong_where_absent += sum(probability >= CONFIG.accepted for probability in found.probability)
 
     def row(self, name: str) -> dict[str, Any]:
         """Return the numbers."""
@@ -107,9 +103,9 @@ def run(options: Options) -> dict[str, Any]:
     fitted = load_probabilities(options.calibration, EVIDENCE)
     tallies: dict[str, WorldTally] = defaultdict(WorldTally)
     for image in tqdm(world_images(options.folder, model, options.every), unit="image"):
-        found = _found(model, fitted, image.part, image.scan)
+        counted = Tally.of(image, _found(model, fitted, image.part, image.scan))
         for name in (image.family, _ALL):
-            tallies[name].add(image, found)
+            tallies[name].add(image, counted)
         if options.strangers and image.stranger is not None and len(image.truth):
             found = _found(model, fitted, image.stranger, image.scan)
             for name in (image.family, _ALL):
@@ -119,12 +115,7 @@ def run(options: Options) -> dict[str, Any]:
     rows = [tally.row(name) for name, tally in tallies.items()]
     print_table("Detection in world bins", rows)
     curves = {
-        name: [
-            {"probability": mean, "share right": share, "poses": count}
-            for mean, share, count in reliability(
-                np.array(tally.found.probability), np.array(tally.found.right, dtype=bool)
-            )
-        ]
+        name: reliability_table(np.array(tally.found.probability), np.array(tally.found.right, dtype=bool))
         for name, tally in tallies.items()
     }
     print_table("Reliability over all", curves[_ALL])

@@ -1,8 +1,8 @@
 """CAD parts made by parameters: sheets, rings, nuts, bolts, brackets, hollow parts, for the world bins.
 
 A part is a union of closed solids that may overlap, as CAD exports often are; `kmn_jax.objects.load_object` keeps the
-outer surface. Lengths are in millimetres. Validation and test share no family, but each has thin, flat, round, hollow
-and many-sided parts, so that what is chosen on one is asked for by the other.
+outer surface. Lengths are in millimetres, longest extents from 20 to 120. Validation and test share no family, but each
+has thin, flat, round, hollow and many-sided parts, so that what is chosen on one is asked for by the other.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from kmn_jax.files import write_whole
 Solid: TypeAlias = tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]]
 
 _AROUND = 48  # corners of a circle; a multiple of 4 and of 6
-_SIZES = (20.0, 120.0)  # of the longest extent
 
 
 def box(low: Sequence[float], high: Sequence[float]) -> Solid:

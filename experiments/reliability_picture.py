@@ -5,10 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Bool, Float
+
 from experiments.evaluation.plots import as_png, new_figure
+from kmn_jax.detection import reliability
 from kmn_jax.files import write_whole
 
 Row = Mapping[str, float]
+
+
+def reliability_table(probability: Float[np.ndarray, " s"], right: Bool[np.ndarray, " s"]) -> list[Row]:
+    """Return rows of mean probability, share of right poses and their number."""
+    return [
+        {"probability": mean, "share right": share, "poses": count}
+        for mean, share, count in reliability(probability, right)
+    ]
 
 
 def save_reliability(tables: Mapping[str, Sequence[Row]], path: Path | None) -> None:

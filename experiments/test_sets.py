@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import json
 import platform
+from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -59,34 +61,50 @@ def build_test_set(
 
     Raises InputError if the folder cannot be written to or holds a test set of another recipe.
     """
-    from tqdm import tqdm
-
-    _claim(folder, config, sensor)
-    numbered = list(enumerate(sources, start=1))
-    missing = [item for item in numbered if not (folder / SPLIT / f"{item[0]:06d}").exists()]
-    one_thread_a_process()
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        made = [pool.submit(_write_scene, folder, config, sensor, *item) for item in missing]
-        for future in tqdm(as_completed(made), total=len(made), unit="object", desc=folder.name):
-            future.result()
-        models = pool.map(_model, [source.path for source in sources])
-        write_models(folder, {object_id: model for (object_id, _), model in zip(numbered, models, strict=True)})
-    frame = BopDataset(folder, SPLIT)[0]
-    write_camera(folder, frame.camera, finest_depth_scale(float(frame.depth.max()), "mm"))
+    claim(folder, {"config": asdict(config), "sensor": asdict(sensor)})
+    scenes = {object_id: (config, sensor, source) for object_id, source in enumerate(sources, start=1)}
+    write_scenes(folder, _write_scene, scenes, [source.path for source in sources], workers)
     return dataset_digest(folder)
 
 
-def _claim(folder: Path, config: PackConfig, sensor: SensorConfig) -> None:
-    """Make the folder, or see that what it holds is of the same recipe; the recipe's file is hidden from digests."""
-    recipe = json.dumps({"config": asdict(config), "sensor": asdict(sensor)}, indent=1) + "\n"
+def write_scenes(
+    folder: Path,
+    write: Callable[..., None],
+    scenes: Mapping[int, tuple[Any, ...]],
+    parts: list[Path],
+    workers: int | None,
+) -> None:
+    """Write a dataset's scenes, but for those that exist, then its models, numbered from 1, and its camera.
+
+    A scene is written in a process of its own, by `write(folder, scene_id, *arguments)`.
+    """
+    from tqdm import tqdm
+
+    missing = {scene_id: own for scene_id, own in scenes.items() if not (folder / SPLIT / f"{scene_id:06d}").exists()}
+    one_thread_a_process()
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        made = [pool.submit(write, folder, scene_id, *own) for scene_id, own in missing.items()]
+        for future in tqdm(as_completed(made), total=len(made), unit="scene", desc=folder.name):
+            future.result()
+        write_models(folder, dict(enumerate(pool.map(metric_model, parts), start=1)))
+    frame = BopDataset(folder, SPLIT)[0]
+    write_camera(folder, frame.camera, finest_depth_scale(float(frame.depth.max()), "mm"))
+
+
+def claim(folder: Path, recipe: dict[str, Any]) -> None:
+    """Make the folder, or see that what it holds is of the same recipe; the recipe's file is hidden from digests.
+
+    Raises InputError if the folder cannot be written to or holds a set of another recipe.
+    """
+    text = json.dumps(recipe, indent=1) + "\n"
     file = folder / ".recipe.json"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if (folder / SPLIT).exists() and (not file.exists() or file.read_text(encoding="utf-8") != recipe):
+        if (folder / SPLIT).exists() and (not file.exists() or file.read_text(encoding="utf-8") != text):
             raise InputError(f"{folder} holds a test set of another recipe: choose another folder, or delete it")
     except OSError as error:
         raise InputError(f"{folder} cannot be written to: {error.strerror}") from None
-    write_whole(file, recipe.encode())
+    write_whole(file, text.encode())
 
 
 def verdict(name: str, digest: str) -> str:
@@ -127,12 +145,13 @@ def made_with() -> dict[str, str]:
     return {"machine": platform.machine(), "processor": processor(), **{name: version(name) for name in _LIBRARIES}}
 
 
-def _model(path: Path) -> ObjectModel:
+def metric_model(path: Path) -> ObjectModel:
+    """Return a part in metres; files that state no unit are in millimetres."""
     return load_object(path).in_unit("m")
 
 
-def _write_scene(folder: Path, config: PackConfig, sensor: SensorConfig, object_id: int, source: Source) -> None:
-    model = _model(source.path)
+def _write_scene(folder: Path, object_id: int, config: PackConfig, sensor: SensorConfig, source: Source) -> None:
+    model = metric_model(source.path)
     mesh = RayMesh(model.vertices, model.triangles)
     shape = collision_shape(model.vertices, model.triangles, config.hulls)
     scenes, _ = bin_scenes(shape, config, int(model.digest[:8], 16))

@@ -9,33 +9,27 @@ asked for in which image, with the number of its copies; other parts have no ent
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from multiprocessing import get_context
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.bins import TrueImage, like_in_size, scan_of
 from experiments.parametric_parts import TEST_FAMILIES, VALIDATION_FAMILIES, write_parts
+from experiments.test_sets import SPLIT, claim, metric_model, write_scenes
 from kmn_jax.bop import (
-    BopDataset,
     BopFrame,
     dataset_digest,
     finest_depth_scale,
-    write_camera,
-    write_models,
     write_scene,
 )
-from kmn_jax.data import load_models, one_thread_a_process, rendered_frame
+from kmn_jax.data import rendered_frame
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
-from kmn_jax.io import Scan
-from kmn_jax.models import Model
-from kmn_jax.objects import ObjectConfig, ObjectModel, load_object, make_part
+from kmn_jax.objects import ObjectModel
 from kmn_jax.simulate import (
     PERFECT,
     Bin,
@@ -55,7 +49,6 @@ from kmn_jax.simulate import (
     settle_in,
 )
 
-SPLIT = "test"
 NAMES, TARGETS = "worlds.json", "test_targets_bop19.json"
 _PARTS_A_FAMILY = 2
 _ABSENT = 4  # of so many images one shows no copy of the part that is asked for
@@ -65,17 +58,8 @@ _PHYSICS = BinConfig(time_cap=3.0, penetration=0.01, attempts=3)
 
 
 @dataclass(frozen=True)
-class WorldImage(TrueImage):
-    """One image of a world; the part is the one that is asked for, and there may be no copy of it."""
-
-    family: str
-    object_id: int  # of the part
-    scan: Scan
-
-
-@dataclass(frozen=True)
 class Family:
-    """One kind of world. Lengths are in diagonals of the part that is asked for, unless they are in millimetres."""
+    """One kind of world. Lengths are in diagonals of the part that is asked for."""
 
     name: str
     half: tuple[float, float] = (0.9, 1.8)  # of the floor's length and width
@@ -120,6 +104,7 @@ class Recipe:
     wider: float  # by which factor the ranges of containers are moved, so that sets differ in them
     images: int = 8  # of each family
     size: tuple[int, int] = (1280, 960)  # of an image, in pixels
+    families: tuple[Family, ...] = FAMILIES  # one scene each
 
 
 VALIDATION = Recipe(11, VALIDATION_FAMILIES, 1.0)
@@ -131,68 +116,20 @@ def build_worlds(folder: Path, recipe: Recipe, workers: int | None = None) -> st
 
     Raises InputError if the folder cannot be written to or holds bins of another recipe.
     """
-    from tqdm import tqdm
-
-    text = json.dumps({"recipe": asdict(recipe), "families": [asdict(family) for family in FAMILIES]}, indent=1) + "\n"
-    file = folder / ".recipe.json"
-    if (folder / SPLIT).exists() and (not file.exists() or file.read_text(encoding="utf-8") != text):
-        raise InputError(f"{folder} holds bins of another recipe: choose another folder, or delete it")
-    try:
-        (folder / ".parts").mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder} cannot be written to: {error.strerror}") from None
-    write_whole(file, text.encode())
-    paths = write_parts(folder / ".parts", recipe.parts, _PARTS_A_FAMILY, recipe.random_seed)
-    missing = [number for number in range(len(FAMILIES)) if not (folder / SPLIT / f"{number + 1:06d}").exists()]
-    one_thread_a_process()
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        made = [pool.submit(_write_family, folder, recipe, paths, number) for number in missing]
-        for future in tqdm(as_completed(made), total=len(made), unit="family", desc=folder.name):
-            future.result()
-        models = pool.map(_model, paths)
-        write_models(folder, dict(enumerate(models, start=1)))
+    claim(folder, asdict(recipe))
+    (folder / ".parts").mkdir(exist_ok=True)
+    parts = write_parts(folder / ".parts", recipe.parts, _PARTS_A_FAMILY, recipe.random_seed)
+    numbers = range(1, len(recipe.families) + 1)
+    write_scenes(folder, _write_family, dict.fromkeys(numbers, (recipe, parts)), parts, workers)
     targets = [
-        entry
-        for number in range(len(FAMILIES))
-        for entry in json.loads((folder / f".targets_{number}.json").read_text(encoding="utf-8"))
+        target
+        for number in numbers
+        for target in json.loads((folder / f".targets_{number}.json").read_text(encoding="utf-8"))
     ]
     write_whole(folder / TARGETS, (json.dumps(targets, indent=1) + "\n").encode())
-    names = {str(number): family.name for number, family in enumerate(FAMILIES, start=1)}
+    names = {str(number): family.name for number, family in enumerate(recipe.families, start=1)}
     write_whole(folder / NAMES, (json.dumps(names, indent=1) + "\n").encode())
-    frame = BopDataset(folder, SPLIT)[0]
-    write_camera(folder, frame.camera, finest_depth_scale(float(frame.depth.max()), "mm"))
     return dataset_digest(folder)
-
-
-def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldImage]:
-    """Yield every so many images. Raises InputError if the folder holds no world bins."""
-    try:
-        targets = json.loads((folder / TARGETS).read_text(encoding="utf-8"))
-        names = json.loads((folder / NAMES).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{folder} holds no world bins ({error}): python -m experiments.build_data worlds") from None
-    dataset = BopDataset(folder, SPLIT, unit="mm")
-    models, problems = load_models(dataset, ObjectConfig(num_points=4096))
-    if problems:
-        raise InputError(f"{folder}: {problems[0]}")
-    parts = {object_id: make_part(found, model) for object_id, found in models.items()}
-    kinds = {object_id: kind_of(dataset.model(object_id).name or "") for object_id in parts}
-    keys = {(key.scene_id, key.image_id): key for key in dataset.keys}
-    for target in targets[::every]:
-        key, object_id = keys[target["scene_id"], target["im_id"]], target["obj_id"]
-        part = parts[object_id]
-        frame = dataset.frame(*key, masks=True).with_visibility()
-        instances = frame.instances or ()
-        yield WorldImage(
-            key,
-            part,
-            like_in_size(part, [other for number, other in parts.items() if kinds[number] != kinds[object_id]]),
-            np.array([instance.T_camera_object for instance in instances]).reshape(-1, 4, 4),
-            np.array([instance.visible_fraction or 0.0 for instance in instances]),
-            names[str(key.scene_id)],
-            object_id,
-            scan_of(frame),
-        )
 
 
 def kind_of(name: str) -> str:
@@ -200,21 +137,15 @@ def kind_of(name: str) -> str:
     return name.rpartition("_")[0]
 
 
-def _model(path: Path) -> ObjectModel:
-    return load_object(path, unit="mm").in_unit("m")
-
-
-def _write_family(folder: Path, recipe: Recipe, paths: list[Path], number: int) -> None:
+def _write_family(folder: Path, scene_id: int, recipe: Recipe, paths: list[Path]) -> None:
     """Write the images of a family of worlds, and which part is asked for in each."""
-    family = FAMILIES[number]
-    rng = np.random.default_rng((recipe.random_seed, number))
-    models: dict[int, tuple[ObjectModel, CollisionShape]] = {}
+    family = recipe.families[scene_id - 1]
+    rng = np.random.default_rng((recipe.random_seed, scene_id - 1))
 
+    @cache
     def loaded(row: int) -> tuple[ObjectModel, CollisionShape]:
-        if row not in models:
-            model = _model(paths[row])
-            models[row] = model, collision_shape(model.vertices, model.triangles)
-        return models[row]
+        model = metric_model(paths[row])
+        return model, collision_shape(model.vertices, model.triangles)
 
     frames: list[BopFrame] = []
     targets = []
@@ -225,17 +156,16 @@ def _write_family(folder: Path, recipe: Recipe, paths: list[Path], number: int) 
         alike = sorted(range(len(paths)), key=lambda other: abs(np.log(loaded(other)[1].diagonal / size)))
         others = [other for other in alike if kind_of(paths[other].stem) != kind_of(paths[row].stem)][:_KINDS]
         absent = image % _ABSENT == _ABSENT - 1
-        frame = next(
-            filter(None, (_image(family, recipe, loaded, row, others, absent, rng) for _ in range(_TRIES))), None
-        )
+        tries = (_image(family, recipe, loaded, row, others, absent, rng) for _ in range(_TRIES))
+        frame = next(filter(None, tries), None)
         if frame is None:
             raise InputError(f"{family.name}: {paths[row].stem} comes to rest in none of {_TRIES} containers")
         instances = tuple(replace(instance, object_id=row + 1) for instance in frame.instances or ())
         frames.append(replace(frame, instances=instances))
-        targets.append({"im_id": image, "inst_count": len(instances), "obj_id": row + 1, "scene_id": number + 1})
-    write_whole(folder / f".targets_{number}.json", json.dumps(targets).encode())
+        targets.append({"im_id": image, "inst_count": len(instances), "obj_id": row + 1, "scene_id": scene_id})
+    write_whole(folder / f".targets_{scene_id}.json", json.dumps(targets).encode())
     farthest = max(float(frame.depth.max()) for frame in frames)
-    write_scene(folder, SPLIT, number + 1, frames, "m", finest_depth_scale(farthest, "m"))
+    write_scene(folder, SPLIT, scene_id, frames, "m", finest_depth_scale(farthest, "m"))
 
 
 def _image(
@@ -250,13 +180,15 @@ def _image(
     """Return one image of a family of worlds; None if parts did not come to rest."""
     model, shape = loaded(row)
     copies = 0 if absent else int(rng.integers(family.copies[0], family.copies[1] + 1))
-    most = family.others if not absent else (family.others if family.others[1] else (0, family.copies[1] // 2))
-    foreign = [others[k] for k in rng.integers(0, len(others), int(rng.integers(most[0], most[1] + 1)))]
+    fewest, most = family.others
+    if absent and not most:
+        most = family.copies[1] // 2
+    foreign = [others[k] for k in rng.integers(0, len(others), int(rng.integers(fewest, most + 1)))]
     container, starts = _container(family, recipe, rng), None
     kinds = [row] * copies + foreign
     if family.rows and copies:
-        grid = (max(1, round(copies**0.5)), max(1, copies // max(1, round(copies**0.5))))
-        starts, half = rows_of(shape, grid, _PHYSICS, int(rng.integers(1 << 31)))
+        side = round(copies**0.5)
+        starts, half = rows_of(shape, (side, copies // side), _PHYSICS, int(rng.integers(1 << 31)))
         container, kinds = container._replace(half=jnp.asarray(half + 0.02, dtype=jnp.float32)), [row] * len(starts)
         copies = len(starts)
     poses, inside = np.zeros((0, 4, 4)), np.zeros(0, dtype=bool)

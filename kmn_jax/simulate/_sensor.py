@@ -44,7 +44,7 @@ class SensorConfig:
     shared_patch: float = 0.1  # how far they share them
     holes: float = 0.0  # share of the pixels that is missing in patches ...
     hole_patch: float = 0.1  # ... of this radius
-    flying: float = 0.0  # share of the pixels beside a jump that hang between its two sides
+    flying: float = 0.0  # share of the pixels beside a jump, as above, that hang between its two sides
 
     @classmethod
     def structured_light(cls) -> SensorConfig:
@@ -145,8 +145,10 @@ def sense(
     missing = exact <= 0
     if config.max_slant < 90:
         missing |= cosine < np.cos(np.radians(config.max_slant))
-    edges = _near_jumps(exact, config.edge_jump * diagonal, config.edge_width) if config.edge_width else missing
-    if config.edge_width and config.edge_loss > 0:
+    edges = np.zeros_like(missing)
+    if config.edge_width and (config.edge_loss > 0 or config.flying > 0):
+        edges = _near_jumps(exact, config.edge_jump * diagonal, config.edge_width)
+    if config.edge_loss > 0:
         missing |= edges & (edge_rng.random(exact.shape, dtype=np.float32) < config.edge_loss)
     pixels = diagonal * camera.fx / float(np.median(exact[exact > 0]))  # that a diagonal is wide
     if config.flank_loss > 0:

@@ -58,7 +58,7 @@ def settle_in(
     dividers = float(np.max(np.asarray(container.divider_height)))
     rng = np.random.default_rng(random_seed)
     fault = "the container is too small for the parts"
-    for _ in range(config.attempts):
+    for _ in range(1 if starts is not None else config.attempts):
         if starts is not None:
             begin = np.stack([body.from_object(start) for body, start in zip(bodies, starts, strict=True)])
         else:
@@ -69,15 +69,14 @@ def settle_in(
             begin = spawned
         end = simulate(bodies, begin, lambda spec, contact: _add_blocks(spec, contact, blocks), config)
         most = config.penetration * SIMULATED_DIAGONAL
-        fault = end.fault or (f"parts penetrate by {end.penetration:.2g} m" if end.penetration > most else "")
+        deep = f"parts penetrate by {end.penetration / SIMULATED_DIAGONAL:.2%} of the diagonal"
+        fault = end.fault or (deep if end.penetration > most else "")
         if not fault:
             places = np.stack([_centre(body, pose) for body, pose in zip(bodies, end.T_world_body, strict=True)])
             places /= SIMULATED_DIAGONAL
             inside = (np.abs(places[:, :2]) <= outer + _ASIDE).all(axis=1) & (places[:, 2] > 0)
             poses = [body.to_object(pose[None])[0] for body, pose in zip(bodies, end.T_world_body, strict=True)]
             return WorldDrop(np.stack(poses), inside)
-        if starts is not None:
-            break  # it would end the same way
     return WorldDrop(np.zeros((0, 4, 4)), np.zeros(0, dtype=bool), fault)
 
 

@@ -25,7 +25,7 @@ def test_solids_are_closed_and_wound_outwards(family: str) -> None:
         corners = vertices[triangles]
         assert np.linalg.det(corners).sum() > 0  # six times the volume
         extents.append(np.ptp(vertices, axis=0))
-        assert 20 <= extents[-1].max() <= 125
+        assert 20 <= extents[-1].max() <= 120
     assert len(np.unique(np.round(extents, 3), axis=0)) == len(extents)
 
 

@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import worlds
+from experiments.bins import WorldImage, world_images
+from experiments.detect_bins import Tally
 from experiments.detect_worlds import WorldTally
-from experiments.worlds import FAMILIES, VALIDATION, WorldImage, build_worlds, kind_of, world_images
+from experiments.test_sets import SPLIT
+from experiments.worlds import FAMILIES, TARGETS, VALIDATION, build_worlds, kind_of
 from kmn_jax.bop import BopDataset
 from kmn_jax.detection import CropPrediction, Detection, Detections, Timing
 from kmn_jax.errors import InputError
@@ -25,41 +27,24 @@ def model() -> Model:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two families of worlds, two of parts, in this process."""
+    """Two families of worlds, two of parts."""
     folder = tmp_path_factory.mktemp("worlds")
-    recipe = replace(VALIDATION, parts=("washer", "lever"), images=4, size=(320, 240))
     families = {family.name: family for family in FAMILIES}
     chosen = (
         replace(families["mixed parts"], sensor="perfect", others=(1, 2), copies=(1, 2)),
         replace(families["touching rows"], sensor="perfect", copies=(4, 4)),
     )
-    patch = pytest.MonkeyPatch()
-    with patch.context() as change:
-        change.setattr(worlds, "FAMILIES", chosen)
-        change.setattr(worlds, "ProcessPoolExecutor", _InThisProcess)
-        build_worlds(folder, recipe)
-        with pytest.raises(InputError, match="another recipe"):
-            build_worlds(folder, replace(recipe, images=5))
+    recipe = replace(VALIDATION, parts=("washer", "lever"), images=4, size=(320, 240), families=chosen)
+    build_worlds(folder, recipe, workers=2)
+    with pytest.raises(InputError, match="another recipe"):
+        build_worlds(folder, replace(recipe, images=5))
     return folder
 
 
-class _InThisProcess:
-    def __init__(self, workers: int | None, mp_context: object) -> None:
-        from concurrent.futures import ThreadPoolExecutor
-
-        self._pool = ThreadPoolExecutor(1)
-
-    def __enter__(self) -> object:
-        return self._pool
-
-    def __exit__(self, *_: object) -> None:
-        self._pool.shutdown()
-
-
 def test_a_quarter_of_the_images_lack_the_part(folder: Path) -> None:
-    targets = json.loads((folder / worlds.TARGETS).read_text())
+    targets = json.loads((folder / TARGETS).read_text())
     assert len(targets) == 8
-    dataset = BopDataset(folder, worlds.SPLIT, unit="mm")
+    dataset = BopDataset(folder, SPLIT, unit="mm")
     assert not dataset.problems()
     for target in targets:
         frame = dataset.frame(target["scene_id"], target["im_id"])
@@ -70,7 +55,7 @@ def test_a_quarter_of_the_images_lack_the_part(folder: Path) -> None:
 
 
 def test_parts_in_rows_touch_nothing_but_each_other(folder: Path) -> None:
-    frame = BopDataset(folder, worlds.SPLIT, unit="mm").frame(2, 0)
+    frame = BopDataset(folder, SPLIT, unit="mm").frame(2, 0)
     heights = np.array([instance.T_camera_object[:3, 3] for instance in frame.instances or ()])
     assert len(heights) == 4
     apart = np.linalg.norm(heights[:, None] - heights[None], axis=2)[~np.eye(4, dtype=bool)].reshape(4, 3)
@@ -102,8 +87,8 @@ def test_counts(folder: Path, model: Model) -> None:
 
     tally = WorldTally()
     beside = present.truth[0] + np.array([[0, 0, 0, 1000.0]] * 3 + [[0] * 4])
-    tally.add(present, found(present, [present.truth[0], beside], 0.95))
-    tally.add(absent, found(absent, [np.eye(4)], 0.7))
+    tally.add(present, Tally.of(present, found(present, [present.truth[0], beside], 0.95)))
+    tally.add(absent, Tally.of(absent, found(absent, [np.eye(4)], 0.7)))
     tally.add_stranger(found(present, [np.eye(4)], 0.2))
     row = tally.row("these")
     assert row["precision"] == pytest.approx(1 / 3)

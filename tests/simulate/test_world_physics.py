@@ -24,10 +24,11 @@ from kmn_jax.simulate import (
     rows_of,
     settle_in,
 )
-from kmn_jax.simulate._blocks import _box
+from tests.reference.meshes import box
 
 CONFIG = BinConfig(penetration=0.01)
-VERTICES, TRIANGLES = block_mesh([_box((0.0, 0, 0), (40.0, 20, 10))])  # millimetres, its corner at the origin
+VERTICES, TRIANGLES = box(40.0, 20.0, 10.0)
+VERTICES = VERTICES + np.array([20.0, 10, 5])  # millimetres, its corner at the origin
 
 
 @pytest.fixture(scope="module")
