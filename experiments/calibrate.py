@@ -2,8 +2,9 @@
 
 Poses are searched in the validation bins (`python -m experiments.build_data validation-bins`), whose objects the
 network was not trained with, and with `--worlds` in the whole scans of world bins; in each of them also a part that is
-not there. A logistic model of the evidence is fitted to whether they are right. Each object's probabilities are also
-predicted by a model that was fitted without it, which gives the reliability that is printed.
+not there. A small model of the evidence is fitted to whether they are right. Each object's probabilities are also
+predicted by a model that was fitted without it, which gives the reliability that is printed. The model of poses as
+they are found is fitted first: it chooses which of them are refined, here as in detection.
 """
 
 from __future__ import annotations
@@ -13,11 +14,10 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import tyro
-from jaxtyping import Int
 from tqdm import tqdm
 
 from experiments.bins import THRESHOLD, TrueImage, bin_images, world_images
@@ -26,7 +26,6 @@ from experiments.reliability_picture import reliability_table, save_reliability
 from experiments.test_sets import SPLIT
 from kmn_jax.detection import (
     EVIDENCE,
-    SIGNS,
     Calibration,
     Candidates,
     DetectConfig,
@@ -49,7 +48,7 @@ from kmn_jax.models import Model, load_model, load_pretrained
 from kmn_jax.objects import Part
 from kmn_jax.report import check_target, print_table, write_json
 
-_PLAIN = DetectConfig(reported=0.5)  # what the depth image speaks for more than against
+_LOOSE = DetectConfig(reported=0.03)  # refines more than detection does, so that the fit sees what is just refused
 SHIPPED = Path(__file__).parent.parent / "kmn_jax" / "pretrained" / "small.calibration.json"
 
 
@@ -70,25 +69,59 @@ class Options:
     picture: Path | None = None  # .png file for the reliability diagram
 
 
+class Search(NamedTuple):
+    """What was found of one part in one image."""
+
+    image: TrueImage
+    part: Part  # the image's own, or its stranger
+    scene: Scene
+    number: int  # that searches of one object share
+    found: Candidates
+
+    def columns(self, found: Candidates) -> dict[str, np.ndarray]:
+        """Return evidence, error and object of poses; those of a part that is not there have no finite error."""
+        error = self.image.errors(found.T_camera_object[found.usable]).min(axis=1, initial=np.inf)
+        return {
+            "evidence": found.evidence[found.usable],
+            "error": error if self.part is self.image.part else np.full_like(error, np.inf),
+            "object": np.full(len(error), self.number),
+        }
+
+
 def collect(options: Options) -> dict[str, np.ndarray]:
     """Return evidence, outcome and object of all poses, and whether they are refined."""
     model = load_pretrained() if options.model is None else load_model(options.model)
     config = DetectConfig().search
     config = replace(config, crops=config.crops.of_network(model.config))
-    columns: dict[str, list[np.ndarray]] = {"evidence": [], "error": [], "object": [], "refined": []}
-    for number, image, scene in _images(options, model):
+    searches = list(_searches(options, model, config))
+    found = [search.columns(search.found) for search in searches]
+    chooser = fit(_joined(found), 1.0, options.folds)[0]
+    refined = [
+        search.columns(refined)
+        for search in tqdm(searches, unit="search", desc="refinement")
+        if (refined := _refined(model, search, chooser, config)) is not None
+    ]
+    stages = [column | {"refined": np.zeros(len(column["error"]), dtype=bool)} for column in found]
+    return _joined([*stages, *(column | {"refined": np.ones(len(column["error"]), dtype=bool)} for column in refined)])
+
+
+def _joined(columns: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    return {name: np.concatenate([part[name] for part in columns]) for name in columns[0]}
+
+
+def _searches(options: Options, model: Model, config: SearchConfig) -> Iterator[Search]:
+    """Search all images for their parts, and every second one for a part that is not there."""
+    for count, (number, image, scene) in enumerate(_images(options, model)):
         rows = seeds_over(scene, scene.foreground, image.part)
-        for part in (image.part, image.stranger):
+        for part in (image.part, image.stranger if count % 2 == 0 else None):
             if part is None:
                 continue
-            stages = _found_and_refined(options, model, part, scene, rows, config)
-            for refined, found in enumerate(stages):
-                error = image.errors(found.T_camera_object[found.usable]).min(axis=1, initial=np.inf)
-                columns["evidence"].append(found.evidence[found.usable])
-                columns["error"].append(error if part is image.part else np.full_like(error, np.inf))
-                columns["object"].append(np.full(len(error), number))
-                columns["refined"].append(np.full(len(error), bool(refined)))
-    return {name: np.concatenate(parts) for name, parts in columns.items()}
+            on_device = device_part(model, part)
+            if options.method == "FPFH":
+                found = fpfh_poses(part, on_device, scene, rows)
+            else:
+                found = search_at(model, on_device, scene, rows, 0, config)
+            yield Search(image, part, scene, number, found)
 
 
 def _images(options: Options, model: Model) -> Iterator[tuple[int, TrueImage, Scene]]:
@@ -105,36 +138,26 @@ def _images(options: Options, model: Model) -> Iterator[tuple[int, TrueImage, Sc
                 yield found.object_id, found, make_scene(found.scan, found.part.diameter)
 
 
-def _found_and_refined(
-    options: Options, model: Model, part: Part, scene: Scene, rows: Int[np.ndarray, " c"], config: SearchConfig
-) -> list[Candidates]:
-    """Return the poses around seeds, and the refined forms of those that the depth image speaks for."""
-    on_device = device_part(model, part)
-    if options.method == "FPFH":
-        found = fpfh_poses(part, on_device, scene, rows)
-    else:
-        found = search_at(model, on_device, scene, rows, 0, config)
-    weights = tuple({"explained": 1.0, "violated": -1.0}.get(name, 0.0) for name in EVIDENCE)
-    choice = chosen(found, Calibration(EVIDENCE, weights, 0.0), on_device, _PLAIN)
-    kept = np.flatnonzero(choice.kept)
-    if not len(kept):
-        return [found]
-    return [found, refined_candidates(on_device, scene, found, kept, 0, config)]
+def _refined(model: Model, search: Search, chooser: Calibration, config: SearchConfig) -> Candidates | None:
+    """Return the refined forms of what a model chooses among the poses of a search; None if it chooses nothing."""
+    on_device = device_part(model, search.part)
+    choice = chosen(search.found, chooser, on_device, _LOOSE)
+    rows = np.flatnonzero(choice.kept | choice.contenders)
+    return refined_candidates(on_device, search.scene, search.found, rows, 0, config) if len(rows) else None
 
 
-def fit(
-    evidence: np.ndarray, error: np.ndarray, objects: np.ndarray, absent_weight: float, folds: int
-) -> tuple[Calibration, dict[str, Any]]:
+def fit(poses: dict[str, np.ndarray], absent_weight: float, folds: int) -> tuple[Calibration, dict[str, Any]]:
     """Return the model of all poses, and how well models predict the objects that they were not fitted to."""
+    evidence, error, objects = (poses[column] for column in ("evidence", "error", "object"))
     right, there = error < THRESHOLD, np.isfinite(error)
     weights = np.where(there, 1.0, absent_weight)
     held_out = np.zeros(len(right))
     names = np.unique(objects)
     for fold in range(folds):
         own = np.isin(objects, names[fold::folds])
-        others = fit_calibration(evidence[~own], right[~own], EVIDENCE, weights[~own], SIGNS)
+        others = fit_calibration(evidence[~own], right[~own], EVIDENCE, weights[~own])
         held_out[own] = others.probability(evidence[own])
-    model = fit_calibration(evidence, right, EVIDENCE, weights, SIGNS)
+    model = fit_calibration(evidence, right, EVIDENCE, weights)
     accepted = held_out >= 0.5
     present = accepted & there
     summary = {
@@ -147,8 +170,7 @@ def fit(
         "accepted among right": float(accepted[right].mean()),
     }
     table = reliability_table(held_out, right)
-    slopes = dict(zip(EVIDENCE, model.weights, strict=True)) | {"bias": model.bias}
-    return model, {"summary": summary, "reliability": table, "weights": slopes}
+    return model, {"summary": summary, "reliability": table}
 
 
 def calibrate(options: Options) -> dict[str, Any]:
@@ -165,8 +187,7 @@ def calibrate(options: Options) -> dict[str, Any]:
     models, results = [], {}
     for name, own in (("found", ~poses["refined"]), ("refined", poses["refined"])):
         weight = options.absent_weight if name == "refined" else 1.0
-        evidence, error, objects = (poses[column][own] for column in ("evidence", "error", "object"))
-        model, results[name] = fit(evidence, error, objects, weight, options.folds)
+        model, results[name] = fit({column: values[own] for column, values in poses.items()}, weight, options.folds)
         models.append(model)
         print_table(f"Reliability of poses as {name}, of objects that were not fitted to", results[name]["reliability"])
         print_table(f"Poses as {name}", [results[name]["summary"]])

@@ -1,9 +1,10 @@
 """From a scan to the ranked poses of an object's copies."""
 
 from kmn_jax.detection._background import BinMargins, away_from_empty, bin_content, in_front_of_empty, inside_bin
-from kmn_jax.detection._bin_program import BinPoses, BinPosesConfig, DeviceCalibration, bin_poses, device_calibration
+from kmn_jax.detection._bin_program import BinPoses, BinPosesConfig, bin_poses, device_calibration
 from kmn_jax.detection._calibration import (
     Calibration,
+    CalibrationArrays,
     Probabilities,
     expected_calibration_error,
     fit_calibration,
@@ -39,13 +40,13 @@ from kmn_jax.detection._depth_agreement import (
 from kmn_jax.detection._detect import THOROUGH, DetectConfig, chosen, detect, detections, explore, refined_candidates
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place, symmetry_transforms
 from kmn_jax.detection._estimator import PartSource, PoseEstimator, ScanSource
-from kmn_jax.detection._evidence import EVIDENCE, SIGNS, gather_evidence
+from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
 from kmn_jax.detection._export import export_estimator
 from kmn_jax.detection._foreground import ForegroundOptions, OrientedBox, foreground
 from kmn_jax.detection._frames import into, placed
 from kmn_jax.detection._mapping import call_rows, map_real, map_rows
-from kmn_jax.detection._outline import OutlineAgreement, outline_agreement
 from kmn_jax.detection._output import as_json, table, write_bop_csv, write_json
+from kmn_jax.detection._picture_agreement import PictureAgreement, picture_agreement
 from kmn_jax.detection._result import CropPrediction, Detection, Detections, Timing
 from kmn_jax.detection._scene import MOST_POINTS, Scene, make_scene
 from kmn_jax.detection._search import (
@@ -67,12 +68,12 @@ __all__ = [
     "EVIDENCE",
     "MOST_POINTS",
     "NUM_SEEDS",
-    "SIGNS",
     "THOROUGH",
     "BinMargins",
     "BinPoses",
     "BinPosesConfig",
     "Calibration",
+    "CalibrationArrays",
     "Candidates",
     "Clock",
     "CropPoses",
@@ -84,14 +85,13 @@ __all__ = [
     "DetectConfig",
     "Detection",
     "Detections",
-    "DeviceCalibration",
     "DevicePart",
     "Draw",
     "DrawsSearch",
     "ForegroundOptions",
     "OrientedBox",
-    "OutlineAgreement",
     "PartSource",
+    "PictureAgreement",
     "PoseEstimator",
     "Prediction",
     "Probabilities",
@@ -132,7 +132,7 @@ __all__ = [
     "map_rows",
     "matches_of",
     "network_prediction",
-    "outline_agreement",
+    "picture_agreement",
     "placed",
     "poses_at",
     "poses_in_crop",

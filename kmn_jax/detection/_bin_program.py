@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
-from kmn_jax.detection._calibration import Calibration
+from kmn_jax.detection._calibration import Calibration, CalibrationArrays
 from kmn_jax.detection._crop_search import CropPoses
 from kmn_jax.detection._depth_agreement import DepthImage
 from kmn_jax.detection._device_part import DevicePart
@@ -25,7 +25,7 @@ from kmn_jax.detection._seeds import spread_seeds
 from kmn_jax.detection._selection import select
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import PaddedCloud, depth_to_points, spread_rows
-from kmn_jax.typing import PRNGKey, Scalar
+from kmn_jax.typing import PRNGKey
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,6 @@ class BinPosesConfig:
             )
 
 
-class DeviceCalibration(NamedTuple):
-    """A `Calibration` on the device."""
-
-    weights: Float[Array, " f"]
-    bias: Scalar
-
-
 class BinPoses(NamedTuple):
     """Poses from the likeliest on, one for each copy, in the camera's frame and the depth image's unit."""
 
@@ -60,9 +53,9 @@ class BinPoses(NamedTuple):
     overflow: Bool[Array, ""]  # more points were measured than are kept, so the image was thinned out
 
 
-def device_calibration(calibration: Calibration) -> DeviceCalibration:
+def device_calibration(calibration: Calibration) -> CalibrationArrays:
     """Put a calibration onto the device."""
-    return DeviceCalibration(jnp.asarray(calibration.weights, dtype=jnp.float32), jnp.float32(calibration.bias))
+    return CalibrationArrays(*(jnp.asarray(leaf, dtype=jnp.float32) for leaf in calibration.arrays()))
 
 
 @partial(jax.jit, static_argnames=("graphdef", "config"))
@@ -70,7 +63,7 @@ def bin_poses(
     graphdef: nnx.GraphDef,
     parameters: nnx.State,
     part: DevicePart,
-    calibration: DeviceCalibration,
+    calibration: CalibrationArrays,
     image: DepthImage,
     foreground: Bool[Array, "h w"],
     key: PRNGKey,
@@ -90,7 +83,7 @@ def poses_in_cloud(
     graphdef: nnx.GraphDef,
     parameters: nnx.State,
     part: DevicePart,
-    calibration: DeviceCalibration,
+    calibration: CalibrationArrays,
     cloud: PaddedCloud,
     is_seed: Bool[Array, " r"],
     image: DepthImage,
@@ -105,8 +98,8 @@ def poses_in_cloud(
         return search_one(graphdef, parameters, part, cloud, image, row, key, config.search)
 
     found, evidence = map_real(search, real, rows, jax.random.split(key, count))
-    logits = jnp.matmul(evidence, calibration.weights, precision=jax.lax.Precision.HIGHEST) + calibration.bias
-    logits = jnp.where(found.poses.converged, logits, -jnp.inf)
+    with jax.default_matmul_precision("highest"):
+        logits = jnp.where(found.poses.converged, calibration.logits(evidence), -jnp.inf)
 
     best = jnp.argmax(logits, axis=1)
     poses, logits = jax.tree.map(lambda leaf: leaf[jnp.arange(count), best], (found.poses, logits))

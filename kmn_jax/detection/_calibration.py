@@ -1,31 +1,80 @@
-"""How probable it is that a pose is right, from the evidence for and against it: a logistic model."""
+"""How probable it is that a pose is right, from the evidence for and against it: a logistic model with hidden units.
+
+What one number says depends on others: that a surface goes on in its plane speaks against a pose, but less so if much
+of a curved surface agrees. Hidden units learn that; ridges and the clipping of what was never seen keep them tame.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from kmn_jax.errors import InputError
 
-_RIDGE = 1e-3  # keeps weights finite where the evidence separates right from wrong completely
+_RIDGE = 3e-3  # on standardised weights: keeps them finite where the evidence separates right from wrong completely
+_HIDDEN = 8
+_EXTREME = 1.0  # percent of the poses on either side, beyond which evidence counts as no more extreme
+_ITERATIONS = 500
+
+
+class CalibrationArrays(NamedTuple):
+    """A `Calibration` as arrays, of f columns and u hidden units."""
+
+    low: Float[Array | np.ndarray, " f"]
+    high: Float[Array | np.ndarray, " f"]
+    hidden_weights: Float[Array | np.ndarray, "f u"]
+    hidden_bias: Float[Array | np.ndarray, " u"]
+    hidden_slopes: Float[Array | np.ndarray, " u"]
+    weights: Float[Array | np.ndarray, " f"]
+    bias: Float[Array | np.ndarray, ""]
+
+    def logits(self, evidence: Float[Array | np.ndarray, "*s f"], xp: ModuleType = jnp) -> Any:
+        """Return the log odds that poses are right, by the functions of jax.numpy or numpy."""
+        clipped = xp.clip(evidence, self.low, self.high)
+        hidden = xp.tanh(clipped @ self.hidden_weights + self.hidden_bias)
+        return clipped @ self.weights + hidden @ self.hidden_slopes + self.bias
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A logistic model: probability = 1 / (1 + exp(-(bias + evidence @ weights)))."""
+    """A model of evidence x: log odds = bias + weights x + slopes tanh(hidden weights x + hidden bias).
+
+    Evidence is clipped to `low` and `high` first. Without hidden units it is a logistic model.
+    """
 
     names: tuple[str, ...]  # of the columns of the evidence
     weights: tuple[float, ...]
     bias: float
+    low: tuple[float, ...] = ()  # no bounds unless given
+    high: tuple[float, ...] = ()
+    hidden_weights: tuple[tuple[float, ...], ...] = ()  # of each hidden unit
+    hidden_bias: tuple[float, ...] = ()
+    hidden_slopes: tuple[float, ...] = ()
+
+    def arrays(self) -> CalibrationArrays:
+        """Return the model as arrays of float64."""
+        count = len(self.names)
+        return CalibrationArrays(
+            np.array(self.low or (-np.inf,) * count),
+            np.array(self.high or (np.inf,) * count),
+            np.array(self.hidden_weights).reshape(-1, count).T,
+            np.array(self.hidden_bias),
+            np.array(self.hidden_slopes),
+            np.array(self.weights),
+            np.array(self.bias),
+        )
 
     def probability(self, evidence: Float[np.ndarray, "s f"]) -> Float[np.ndarray, " s"]:
         """Return the probability that each pose is right."""
-        return _logistic(self.bias + evidence.astype(np.float64) @ np.array(self.weights))
+        return _logistic(self.arrays().logits(evidence.astype(np.float64), np))
 
 
 def fit_calibration(
@@ -33,12 +82,11 @@ def fit_calibration(
     right: Bool[np.ndarray, " s"],
     names: Sequence[str],
     weights: Float[np.ndarray, " s"] | None = None,
-    signs: Mapping[str, int] | None = None,
+    hidden_units: int = _HIDDEN,
 ) -> Calibration:
     """Fit to poses of which it is known whether they are right; `weights` count some as several.
 
-    Columns whose sign is 1 may only speak for a pose, those of -1 only against it: what is fitted then holds better
-    in scenes of another kind. Raises InputError if all are right or all are wrong.
+    The same arguments give the same model. Raises InputError if all are right or all are wrong.
     """
     from scipy.optimize import minimize
 
@@ -46,25 +94,50 @@ def fit_calibration(
         raise InputError(
             f"{int(right.sum())} of {len(right)} poses are right: to fit probabilities, some must be wrong"
         )
-    mean, scale = evidence.mean(axis=0), evidence.std(axis=0)
+    low, high = np.percentile(evidence.astype(np.float64), (_EXTREME, 100 - _EXTREME), axis=0)
+    clipped = np.clip(evidence.astype(np.float64), low, high)
+    mean, scale = clipped.mean(axis=0), clipped.std(axis=0)
     scale = np.where(scale > 0, scale, 1)
-    columns = np.concatenate([(evidence - mean) / scale, np.ones((len(evidence), 1))], axis=1).astype(np.float64)
+    columns = (clipped - mean) / scale
     counts = np.ones(len(right)) if weights is None else weights
-    ridge = _RIDGE * counts.sum() * np.append(np.ones(len(scale)), 0.0)
+    counts = counts / counts.sum()
+    f, u = columns.shape[1], hidden_units
+    shapes = ((f, u), (u,), (u,), (f,), ())
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
+    ridge = np.concatenate([np.full(f * u, _RIDGE), np.zeros(u), np.full(u + f, _RIDGE), np.zeros(1)])
+
+    def unpacked(solution: Float[np.ndarray, " g"]) -> list[Float[np.ndarray, "..."]]:
+        parts = np.split(solution, ends[:-1])
+        return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
 
     def loss(solution: Float[np.ndarray, " g"]) -> tuple[float, Float[np.ndarray, " g"]]:
-        logits = columns @ solution
+        inner, inner_bias, slopes, direct, bias = unpacked(solution)
+        hidden = np.tanh(columns @ inner + inner_bias)
+        logits = hidden @ slopes + columns @ direct + bias
         value = counts @ (np.logaddexp(0, logits) - right * logits) + ridge @ solution**2 / 2
-        slope = columns.T @ (counts * (_logistic(logits) - right)) + ridge * solution
-        return float(value / counts.sum()), slope / counts.sum()
+        error = counts * (_logistic(logits) - right)
+        back = np.outer(error, slopes) * (1 - hidden**2)
+        slope = [columns.T @ back, back.sum(axis=0), hidden.T @ error, columns.T @ error, error.sum()]
+        return float(value), np.concatenate([part.reshape(-1) for part in slope]) + ridge * solution
 
-    ranges = {1: (0, None), -1: (None, 0), 0: (None, None)}
-    bounds = [ranges[(signs or {}).get(name, 0)] for name in names] + [ranges[0]]
-    start = np.zeros(columns.shape[1])
-    options = {"maxiter": 10_000, "maxfun": 100_000, "ftol": 1e-15, "gtol": 1e-9}
-    solution = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
-    slopes = solution[:-1] / scale
-    return Calibration(tuple(names), tuple(slopes.tolist()), float(solution[-1] - slopes @ mean))
+    start = np.zeros(ends[-1])
+    rng = np.random.default_rng(0)
+    start[: f * u] = rng.normal(size=f * u) / np.sqrt(f)
+    start[f * u + u : f * u + 2 * u] = rng.normal(size=u) / 4
+    options = {"maxiter": _ITERATIONS, "maxfun": 2 * _ITERATIONS, "ftol": 1e-12, "gtol": 1e-8}
+    solution = minimize(loss, start, jac=True, method="L-BFGS-B", options=options).x
+    inner, inner_bias, slopes, direct, bias = unpacked(solution)
+    inner, direct = inner / scale[:, None], direct / scale
+    return Calibration(
+        tuple(names),
+        tuple(direct.tolist()),
+        float(bias - direct @ mean),
+        tuple(low.tolist()),
+        tuple(high.tolist()),
+        tuple(map(tuple, inner.T.tolist())),
+        tuple((inner_bias - mean @ inner).tolist()),
+        tuple(slopes.tolist()),
+    )
 
 
 def _logistic(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
@@ -105,17 +178,35 @@ def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
     """Read models of the evidence with the given names. Raises InputError if the file holds anything else."""
     try:
         stored = json.loads(Path(path).read_text(encoding="utf-8"))
-        models = [
-            Calibration(
-                tuple(str(name) for name in found["names"]),
-                tuple(float(weight) for weight in found["weights"]),
-                float(found["bias"]),
-            )
-            for found in (stored["found"], stored["refined"])
-        ]
-        finite = all(np.isfinite([*model.weights, model.bias]).all() for model in models)
+        models = [_read(found) for found in (stored["found"], stored["refined"])]
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is not a readable calibration: {error}") from None
-    if any(model.names != tuple(names) or len(model.weights) != len(names) for model in models) or not finite:
+    if any(model.names != tuple(names) for model in models):
         raise InputError(f"{path} is a calibration of other evidence: fit it again with experiments.calibrate")
     return Probabilities(*models)
+
+
+def _read(stored: dict[str, Any]) -> Calibration:
+    """Return a model of its JSON form. Raises KeyError, TypeError or ValueError if it is none."""
+    names = tuple(str(name) for name in stored["names"])
+
+    def numbers(name: str, count: int, given: Any = None) -> tuple[float, ...]:
+        values = tuple(float(value) for value in (stored[name] if given is None else given))
+        if len(values) != count or not np.isfinite(values).all():
+            raise ValueError(f"{name} are not {count} finite numbers")
+        return values
+
+    units = len(stored["hidden_slopes"])
+    if len(stored["hidden_weights"]) != units:
+        raise ValueError(f"hidden_weights are not those of {units} units")
+    low, high = (numbers(name, len(names) if stored[name] else 0) for name in ("low", "high"))
+    return Calibration(
+        names=names,
+        weights=numbers("weights", len(names)),
+        bias=numbers("bias", 1, [stored["bias"]])[0],
+        low=low,
+        high=high,
+        hidden_weights=tuple(numbers("hidden_weights", len(names), row) for row in stored["hidden_weights"]),
+        hidden_bias=numbers("hidden_bias", units),
+        hidden_slopes=numbers("hidden_slopes", units),
+    )

@@ -20,16 +20,15 @@ class DepthAgreementConfig:
 
     tolerance: float = 0.03  # between predicted and measured depth
     sunk: float = 0.2  # what lies in front by less than this is more likely the surface itself than another part
-    outline_cells: int = 40  # of a grid over the object's picture, along the longer side; see _outline.py
     window: int = 1  # pixels to each side in which a measurement may lie: edges are off by one
     splat: SplatConfig = field(default_factory=lambda: SplatConfig(resolution=128))
 
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
-        if not 0 < self.tolerance < self.sunk or self.window < 0 or self.outline_cells < 1:
+        if not 0 < self.tolerance < self.sunk or self.window < 0:
             raise InputError(
-                f"tolerance = {self.tolerance} must be above zero and below sunk = {self.sunk}, outline_cells ="
-                f" {self.outline_cells} above zero, and window = {self.window} not below zero"
+                f"tolerance = {self.tolerance} must be above zero and below sunk = {self.sunk}, and window ="
+                f" {self.window} not below zero"
             )
 
 
@@ -84,15 +83,13 @@ def depth_agreement(
     )
 
 
-def farthest_at(
-    depth: Float[Array, "h w"], camera: Intrinsics, x: Float[Array, " r"], y: Float[Array, " r"], reach: int
-) -> Float[Array, " r"]:
-    """Return the farthest of what was measured around directions (x, y, 1), up to `reach` pixels away; zero if nothing.
-
-    Images of clouds have holes where no point fell into a pixel.
-    """
-    row, column, _ = _pixels(jnp.stack([x, y, jnp.ones_like(x)], axis=1), jnp.ones(x.shape, dtype=bool), camera)
-    return _window(depth, row, column, reach).max(axis=1)
+def depth_at(image: DepthImage, x: Float[Array, "*s"], y: Float[Array, "*s"]) -> Float[Array, "*s"]:
+    """Return what was measured in directions (x, y, 1); zero where nothing was, and outside of the image."""
+    camera = image.camera
+    row, column = (
+        jnp.round(f * way + c).astype(jnp.int32) for f, way, c in ((camera.fy, y, camera.cy), (camera.fx, x, camera.cx))
+    )
+    return _value(image.depth, row, column)
 
 
 def _window(
@@ -103,7 +100,7 @@ def _window(
     return jnp.stack([_value(depth, row + u, column + v) for u, v in steps], axis=1)
 
 
-def _value(depth: Float[Array, "h w"], row: Int[Array, " m"], column: Int[Array, " m"]) -> Float[Array, " m"]:
+def _value(depth: Float[Array, "h w"], row: Int[Array, "*s"], column: Int[Array, "*s"]) -> Float[Array, "*s"]:
     height, width = depth.shape
     inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
     return jnp.where(inside, depth[jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)], 0)

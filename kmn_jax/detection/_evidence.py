@@ -9,23 +9,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from kmn_jax.detection._crop_search import CropPoses, Prediction
-from kmn_jax.detection._depth_agreement import DepthAgreementConfig, DepthImage, depth_agreement
+from kmn_jax.detection._depth_agreement import DepthAgreement, DepthAgreementConfig, DepthImage, depth_agreement
 from kmn_jax.detection._mapping import map_real
-from kmn_jax.detection._outline import outline_agreement
+from kmn_jax.detection._picture_agreement import PictureAgreement, picture_agreement
 from kmn_jax.geometry import inverse, nearest, transform_points
 from kmn_jax.objects import PartArrays
 from kmn_jax.pose import PoseResult
 from kmn_jax.simulate import Surfels
 from kmn_jax.typing import Scalar
 
-EVIDENCE = (
+# Each is described where it is computed: of the picture in `PictureAgreement` and `DepthAgreement`.
+_OF_CROP = (
     "surface",  # score of the crop's points, see `CropPoses`; of a refined pose that of the pose that it was made of
-    "explained",  # of the picture area of the pose, see `DepthAgreement`
-    "violated",
-    "occluded",
-    "unknown",
-    "sunk",
-    "confirmed",  # explained, of what was explained or violated
     "fit",  # share of the points on the object that are near to the pose's surface
     "rms_error",  # of these, in diameters
     "inlier_share",  # of the matches
@@ -35,14 +30,8 @@ EVIDENCE = (
     "covered",  # share of the crop's points on the pose's surface that are on the object
     "certainty",  # mean probability of the likeliest keypoint
     "object_share",  # of the crop's points that are on the object
-    "open",  # share of the pose's outline, see `OutlineAgreement`
-    "level",
-    "open_explained",  # products: an explained pose and a hidden one end differently
-    "open_occluded",
 )
-_AGAINST = {"violated", "occluded", "unknown", "sunk", "rms_error", "level"}
-# Whether more of it speaks for a pose, or against it, or either, as for a part that fills its crop or does not.
-SIGNS = {name: -1 if name in _AGAINST else 0 if name == "object_share" else 1 for name in EVIDENCE}
+EVIDENCE = (*DepthAgreement._fields, *PictureAgreement._fields, *_OF_CROP)
 _NEAR = 0.1  # diameters
 _SURFACE = 0.05  # diameters; points so near to a surface with a normal like it lie on it
 _ALIKE = 0.5  # cosine
@@ -73,7 +62,7 @@ def _evidence(
     config: DepthAgreementConfig,
 ) -> Float[Array, " f"]:
     pose, on_object = found.T_scene_object, prediction.on_object
-    outline = outline_agreement(pose, surfels, image, part.diameter, config)
+    picture = picture_agreement(pose, surfels, image, part.diameter)
     seen = depth_agreement(pose, surfels, image, part.diameter, config)
     local = transform_points(inverse(pose), prediction.points + seed[None])
     label, _ = nearest(local, part.points[: keypoint_scores.shape[1]])
@@ -86,10 +75,7 @@ def _evidence(
     columns = {
         "surface": score,
         **seen._asdict(),
-        **outline._asdict(),
-        "open_explained": outline.open * seen.explained,
-        "open_occluded": outline.open * seen.occluded,
-        "confirmed": seen.explained / jnp.maximum(seen.explained + seen.violated, 1e-6),
+        **picture._asdict(),
         "fit": _mean(near, on_object),
         "rms_error": jnp.where(near.any(), jnp.sqrt(_mean(distance**2, near)), _NEAR),
         "inlier_share": found.score,

@@ -1,0 +1,276 @@
+"""The picture of an object at a pose against the measured surface: does the surface lie, turn and end as it should?
+
+A flat part agrees with every floor, wall and rim in depth and normals. What tells them apart is the outline, where a
+larger surface goes on in its own plane, and how much of the surface there is to agree with. So both are compared in
+cells of a grid over the object's picture, each with a depth and a normal as predicted and as measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Shaped
+
+from kmn_jax.detection._depth_agreement import DepthImage, depth_at
+from kmn_jax.geometry import transform_points
+from kmn_jax.simulate import Surfels
+from kmn_jax.typing import Pose, Scalar
+
+_CELLS = 32  # of the grid, along the longer side of the picture
+_SPARE = 3  # cells beyond it, on each side
+_SIDE = _CELLS + 2 * _SPARE
+_SAMPLES = ((0.0, 0.0), (-0.3, -0.3), (0.3, -0.3), (-0.3, 0.3), (0.3, 0.3))  # places in a cell, in cells
+# Lengths are in diameters of the object, normals are compared by their cosines.
+_TIGHT, _NEAR, _LOOSE = 0.01, 0.02, 0.04  # between depths
+_LEVEL = 0.03  # the same, across the outline, where the surface may bend
+_ONE_SURFACE = 0.06  # between the depths of neighbouring cells, beyond what the slant of the view explains
+_STEEP = 2.5  # cells: that slant
+_STEP_SEEN, _STEP = 0.04, 0.08  # of depth between neighbouring cells, for an edge
+_ALIKE, _TURNED = 0.85, 0.5
+_PLANE, _PLANE_ALIKE = 0.015, 0.9  # of what lies in one plane
+_REACH = 3  # cells over which a plane is fitted
+_HIGHEST = jax.lax.Precision.HIGHEST
+
+
+class PictureAgreement(NamedTuple):
+    """Shares of the cells of an object's picture, then of its outline; the outline is what is two cells away from it.
+
+    Holes have an outline, too. Cells of the picture outside of the image count as not measured, those of the outline
+    are left out.
+    """
+
+    tight: Scalar  # measured within 1% of the diameter
+    near: Scalar  # within 2%
+    behind: Scalar  # farther than that
+    aligned: Scalar  # of what is measured about where it should be: the normal is as it should be
+    turned: Scalar  # of the same: the normal is quite another
+    with_normal: Scalar  # measured densely enough for a normal
+    variety: Scalar  # of the predicted normals: 0 for a plane, towards 1 for a ball
+    confirmed_variety: Scalar  # the same of those that are confirmed
+    deviation: Scalar  # root mean square of the differences in depth where they are small, in diameters
+    offset: Scalar  # their mean
+    noise: Scalar  # of depths within a cell, in diameters
+    log_cells: Scalar
+    log_area: Scalar  # of what is measured within 2%, in the square of the diameter
+    edges: Scalar  # of predicted steps in depth inside of the picture: those that are measured
+    strange_edges: Scalar  # of the cells inside: a step is measured, and none is predicted
+    open: Scalar  # something farther away was measured, or nothing, as where the background is cut away
+    stepped: Scalar  # something farther away by 1% of the diameter was measured
+    level: Scalar  # the measured surface goes on
+    level_tightly: Scalar  # the same within 1%
+    fronted: Scalar  # something in front was measured
+    coplanar: Scalar  # the measured surface goes on in one plane
+    free_level: Scalar  # of the outline that nothing in front hides: the measured surface goes on
+
+
+class _Predicted(NamedTuple):
+    """Cells of an object's picture; u and v are directions (u, v, 1) to their centres."""
+
+    mask: Bool[Array, "s s"]
+    depth: Float[Array, "s s"]
+    normals: Float[Array, "s s 3"]
+    u: Float[Array, "s s"]
+    v: Float[Array, "s s"]
+    pitch: Scalar  # of directions
+    nearest: Scalar  # depth of the nearest point
+
+
+class _Measured(NamedTuple):
+    """The same cells of a depth image."""
+
+    in_image: Bool[Array, "s s"]
+    there: Bool[Array, "s s"]
+    depth: Float[Array, "s s"]
+    away: Float[Array, "s s"]  # of the sample nearest to the predicted depth from it
+    noise: Float[Array, "s s"]
+    points: Float[Array, "s s 3"]
+    normals: Float[Array, "s s 3"]
+    has_normal: Bool[Array, "s s"]
+
+
+def picture_agreement(T_camera_object: Pose, surfels: Surfels, image: DepthImage, diameter: Scalar) -> PictureAgreement:
+    """Compare an object at a pose with a depth image in the same unit, zero where nothing was measured.
+
+    All is zero of a pose that shows nothing to the camera.
+    """
+    seen = _predicted(T_camera_object, surfels, image)
+    found = _measured(seen, image, diameter)
+    mask, there = seen.mask, found.there
+    away = found.away / diameter
+    gap = jnp.where(there, found.depth - seen.depth, 0) / diameter
+
+    def share(which: Bool[Array, "s s"], of: Bool[Array, "s s"] = mask) -> Scalar:
+        return (of & which).sum(dtype=jnp.float32) / jnp.maximum(of.sum(dtype=jnp.float32), 1)
+
+    def mean(values: Float[Array, "s s"], of: Bool[Array, "s s"]) -> Scalar:
+        return jnp.where(of, values, 0).sum() / jnp.maximum(of.sum(dtype=jnp.float32), 1)
+
+    def variety(of: Bool[Array, "s s"]) -> Scalar:
+        total = jnp.where(of[..., None], seen.normals, 0).sum(axis=(0, 1))
+        return jnp.where(of.any(), 1 - jnp.sqrt((total**2).sum()) / jnp.maximum(of.sum(dtype=jnp.float32), 1), 0)
+
+    tight, near, loose = (mask & there & (away < limit) for limit in (_TIGHT, _NEAR, _LOOSE))
+    cosine = (seen.normals * found.normals).sum(axis=-1)
+    compared = loose & found.has_normal
+    small = loose & (jnp.abs(gap) < _LOOSE)
+    inside = ~_grown(~mask)
+    predicted_step, measured_step = _steps(seen.depth, mask) / diameter, _steps(found.depth, there) / diameter
+    edges = inside & (predicted_step > _STEP)
+    return PictureAgreement(
+        tight=share(tight),
+        near=share(near),
+        behind=share(there & (gap > _TIGHT) & ~tight),
+        aligned=share(cosine > _ALIKE, compared),
+        turned=share(cosine < _TURNED, compared),
+        with_normal=share(found.has_normal),
+        variety=variety(mask),
+        confirmed_variety=variety(compared & (cosine > _ALIKE)),
+        deviation=jnp.sqrt(mean(gap**2, small)),
+        offset=mean(gap, small),
+        noise=mean(found.noise, small) / diameter,
+        log_cells=jnp.log1p(mask.sum(dtype=jnp.float32)),
+        log_area=jnp.log(near.sum(dtype=jnp.float32) * (seen.pitch * seen.nearest / diameter) ** 2 + 1e-4),
+        edges=share(measured_step > _STEP_SEEN, edges),
+        strange_edges=share((measured_step > _STEP) & (predicted_step < _STEP_SEEN), inside),
+        **_outline(seen, found, compared, diameter),
+    )
+
+
+def _predicted(T_camera_object: Pose, surfels: Surfels, image: DepthImage) -> _Predicted:
+    points = transform_points(T_camera_object, surfels.points)
+    normals = jnp.matmul(surfels.normals, T_camera_object[:3, :3].T, precision=_HIGHEST)
+    facing = ((points * normals).sum(axis=1) < 0) & (points[:, 2] > 0)
+    some = facing.any()
+    nearest = jnp.where(some, jnp.where(facing, points[:, 2], jnp.inf).min(), 1)
+    z = jnp.where(facing, points[:, 2], nearest)
+    directions = points[:, :2] / z[:, None]
+    low, high = (
+        jnp.where(some, bound(jnp.where(facing[:, None], directions, worst), axis=0), 0)
+        for bound, worst in ((jnp.min, jnp.inf), (jnp.max, -jnp.inf))
+    )
+    # No finer than pixels, nor than surfels are apart, so that there is one in or next to each cell of the surface.
+    spacing = jnp.sqrt(surfels.area / surfels.points.shape[0])
+    finest = jnp.maximum(spacing / nearest, 1 / image.camera.fx)
+    pitch = jnp.maximum((high - low).max() / (_CELLS - 1), finest)
+    place = jnp.round((directions - low[None]) / pitch).astype(jnp.int32) + _SPARE
+    index = place[:, 1] * _SIDE + place[:, 0]
+    front = jnp.full(_SIDE**2, jnp.inf).at[jnp.where(facing, index, _SIDE**2)].min(z, mode="drop")
+    # The surface of a cell is what lies about as near as its nearest point.
+    shown = facing & (z <= front[jnp.clip(index, 0, _SIDE**2 - 1)] + spacing + pitch * nearest)
+    columns = jnp.concatenate([normals, z[:, None], jnp.ones_like(z)[:, None]], axis=1)
+    sums = jnp.zeros((_SIDE**2, 5)).at[jnp.where(shown, index, _SIDE**2)].add(columns, mode="drop")
+    mask = (sums[:, 4] > 0).reshape(_SIDE, _SIDE)
+    length = jnp.sqrt(jnp.maximum((sums[:, :3] ** 2).sum(axis=1, keepdims=True), 1e-12))
+    steps = (jnp.arange(_SIDE, dtype=jnp.float32) - _SPARE) * pitch
+    u, v = jnp.meshgrid(low[0] + steps, low[1] + steps)
+    depth = (sums[:, 3] / jnp.maximum(sums[:, 4], 1)).reshape(_SIDE, _SIDE)
+    return _Predicted(mask, depth, (sums[:, :3] / length).reshape(_SIDE, _SIDE, 3), u, v, pitch, nearest)
+
+
+def _measured(seen: _Predicted, image: DepthImage, diameter: Scalar) -> _Measured:
+    samples = jnp.stack([depth_at(image, seen.u + du * seen.pitch, seen.v + dv * seen.pitch) for du, dv in _SAMPLES])
+    column, row = image.camera.fx * seen.u + image.camera.cx, image.camera.fy * seen.v + image.camera.cy
+    in_image = (column >= 0) & (column < image.camera.width) & (row >= 0) & (row < image.camera.height)
+    real = samples > 0
+    there = real.any(axis=0)
+    anchor = jnp.where(real[0], samples[0], samples[1:].max(axis=0))
+    own = real & (jnp.abs(samples - anchor[None]) < _LOOSE * diameter)
+    count = jnp.maximum(own.sum(axis=0, dtype=jnp.float32), 1)
+    depth = jnp.where(own, samples, 0).sum(axis=0) / count
+    noise = jnp.sqrt(jnp.where(own, (samples - depth[None]) ** 2, 0).sum(axis=0) / jnp.maximum(count - 1, 1))
+    away = jnp.where(real, jnp.abs(samples - seen.depth[None]), jnp.inf).min(axis=0)
+    points = jnp.stack([seen.u, seen.v, jnp.ones_like(seen.u)], axis=-1) * depth[..., None]
+    reach = _ONE_SURFACE * diameter + _STEEP * seen.pitch * seen.nearest
+    (along_u, has_u), (along_v, has_v) = (_slope(points, there, axis, reach) for axis in (1, 0))
+    normals = jnp.cross(along_v, along_u)
+    length = jnp.sqrt(jnp.maximum((normals**2).sum(axis=-1, keepdims=True), 1e-24))
+    normals = normals / length
+    normals = jnp.where((normals * points).sum(axis=-1, keepdims=True) > 0, -normals, normals)
+    return _Measured(in_image, there, depth, away, noise, points, normals, has_u & has_v & (length[..., 0] > 1e-12))
+
+
+def _slope(
+    points: Float[Array, "s s 3"], there: Bool[Array, "s s"], axis: int, reach: Scalar
+) -> tuple[Float[Array, "s s 3"], Bool[Array, "s s"]]:
+    """Return the way from cell to cell along an axis, where both are on one surface."""
+    ways, known = [], []
+    for step in (-1, 1):
+        way = step * (points - jnp.roll(points, step, axis))
+        same = there & jnp.roll(there, step, axis) & (jnp.abs(way[..., 2]) < reach)
+        ways.append(jnp.where(same[..., None], way, 0))
+        known.append(same)
+    return ways[0] + ways[1], known[0] | known[1]
+
+
+def _outline(seen: _Predicted, found: _Measured, compared: Bool[Array, "s s"], diameter: Scalar) -> dict[str, Scalar]:
+    """Return how the measured surface goes on beyond the outline."""
+    edge = _grown(seen.mask)
+    outline = _grown(edge) & ~edge & found.in_image
+    # Of cells without depth, the farthest of those around, twice.
+    depth = jnp.where(seen.mask, seen.depth, -jnp.inf)
+    for _ in range(2):
+        depth = jnp.where(jnp.isfinite(depth), depth, _most(depth, -jnp.inf))
+    gap = jnp.where(outline & found.there, found.depth - depth, 0) / diameter
+    there = outline & found.there
+    fronted = there & (gap < -_LEVEL)
+    level = there & (jnp.abs(gap) <= _LEVEL)
+    # The plane of what is measured on the object near by.
+    count, normal, center = (
+        _summed(jnp.where(compared[..., None], values, 0), _REACH)
+        for values in (jnp.ones((_SIDE, _SIDE, 1)), found.normals, found.points)
+    )
+    normal = normal / jnp.sqrt(jnp.maximum((normal**2).sum(axis=-1, keepdims=True), 1e-24))
+    height = ((found.points - center / jnp.maximum(count, 1)) * normal).sum(axis=-1) / diameter
+    parallel = (found.normals * normal).sum(axis=-1) > _PLANE_ALIKE
+    coplanar = there & (count[..., 0] > 0) & (jnp.abs(height) < _PLANE) & found.has_normal & parallel
+
+    def share(which: Bool[Array, "s s"], of: Bool[Array, "s s"] = outline) -> Scalar:
+        return (of & which).sum(dtype=jnp.float32) / jnp.maximum(of.sum(dtype=jnp.float32), 1)
+
+    return {
+        "open": share(~found.there | (gap > _LEVEL)),
+        "stepped": share(there & (gap > _TIGHT)),
+        "level": share(level),
+        "level_tightly": share(there & (jnp.abs(gap) <= _TIGHT)),
+        "fronted": share(fronted),
+        "coplanar": share(coplanar),
+        "free_level": share(level, outline & ~fronted),
+    }
+
+
+def _around(values: Shaped[Array, "s s ..."], reach: int, fill: float | bool) -> list[Shaped[Array, "s s ..."]]:
+    """Return an image shifted by up to so many cells along its first axis."""
+    rest = [(0, 0)] * (values.ndim - 1)
+    padded = jnp.pad(values, [(reach, reach), *rest], constant_values=fill)
+    return [padded[step : step + values.shape[0]] for step in range(2 * reach + 1)]
+
+
+def _along_both(
+    values: Shaped[Array, "s s ..."],
+    reach: int,
+    fill: float | bool,
+    join: Callable[[Shaped[Array, "k s s ..."]], Shaped[Array, "s s ..."]],
+) -> Shaped[Array, "s s ..."]:
+    for _ in range(2):
+        values = jnp.swapaxes(join(jnp.stack(_around(values, reach, fill))), 0, 1)
+    return values
+
+
+def _grown(mask: Bool[Array, "s s"]) -> Bool[Array, "s s"]:
+    return _along_both(mask, 1, False, lambda shifted: shifted.any(axis=0))
+
+
+def _most(values: Float[Array, "s s"], fill: float) -> Float[Array, "s s"]:
+    return _along_both(values, 1, fill, lambda shifted: shifted.max(axis=0))
+
+
+def _summed(values: Float[Array, "s s c"], reach: int) -> Float[Array, "s s c"]:
+    return _along_both(values, reach, 0.0, lambda shifted: shifted.sum(axis=0))
+
+
+def _steps(depth: Float[Array, "s s"], of: Bool[Array, "s s"]) -> Float[Array, "s s"]:
+    """Return the difference of the farthest and the nearest depth around each cell; not finite where there is none."""
+    return _most(jnp.where(of, depth, -jnp.inf), -jnp.inf) + _most(jnp.where(of, -depth, -jnp.inf), -jnp.inf)
