@@ -15,8 +15,10 @@ from kmn_jax.geometry import (
     compose,
     from_quaternion_translation,
     from_rotation_translation,
+    group_points,
     inverse,
     nearest,
+    nearest_within,
     transform_points,
 )
 from kmn_jax.pose._kabsch import fit_rigid, rotation_is_determined
@@ -25,6 +27,7 @@ from kmn_jax.typing import ArrayInput, Mask, Normals, Points, Pose, Scalar
 
 _MIN_PAIRS = 6  # equations that fix a pose when each pair gives one
 _DIVERGED = 0.01  # of the squared gate: a cost that grows by less is noise about the optimum
+_FEW_DISTANCES = 2**20  # up to which all of them take CPUs less time than groups
 _DAMPING = 1e-5  # of the mean diagonal: directions that no pair constrains stay where they are
 
 
@@ -146,6 +149,23 @@ def _icp(
     num_scene = jnp.maximum(scene_mask.sum(dtype=jnp.int32), 1).astype(jnp.float32)
     gate = config.distance_gate
 
+    place = jnp.arange(scene.shape[0], dtype=jnp.int32)
+    grouped = scene.shape[0] * model.shape[0] > _FEW_DISTANCES
+    if grouped:
+        groups, blocks = group_points(model, object_mask), group_points(scene, scene_mask)
+        # The pose moves all scene points as one: blocks of them that lie together stay together.
+        place = (
+            jnp.zeros_like(place)
+            .at[jnp.where(blocks.mask, blocks.rows, scene.shape[0]).reshape(-1)]
+            .set(jnp.arange(blocks.rows.size, dtype=jnp.int32), mode="drop")
+        )
+
+    def nearest_of_object(local: Points) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
+        if not grouped:
+            return nearest(local, model, object_mask)
+        rows, distances = nearest_within(local[blocks.rows], blocks.mask, groups, gate)
+        return rows.reshape(-1)[place], distances.reshape(-1)[place]
+
     def residuals(pairs_moved: Points) -> Float[Array, " n"]:
         difference = pairs_moved - scene
         if config.method == "point_to_plane":
@@ -153,7 +173,7 @@ def _icp(
         return jnp.sqrt((difference**2).sum(axis=1))
 
     def find_pairs(pose: Pose) -> _Pairs:
-        index, distance = nearest(transform_points(inverse(pose), scene), model, object_mask)
+        index, distance = nearest_of_object(transform_points(inverse(pose), scene))
         moved = transform_points(pose, model[index])
         inside = scene_mask & (distance <= gate)
         cost = jnp.where(inside, residuals(moved) ** 2, gate**2)

@@ -13,7 +13,7 @@ from kmn_jax.geometry import (
     rotate_vectors,
     transform_points,
 )
-from kmn_jax.pose import IcpConfig, PoseStatus, icp
+from kmn_jax.pose import IcpConfig, PoseStatus, _icp, icp
 
 DIAMETER = 50.0
 METHODS = ["point_to_plane", "point_to_point"]
@@ -221,3 +221,23 @@ def test_what_fixes_no_pose_is_no_success(case: str) -> None:
     result = icp(points, scene, np.eye(4), 3.0, scene_normals)
     assert not bool(result.converged)
     np.testing.assert_array_equal(result.T_scene_object, np.eye(4))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_many_points_end_where_all_distances_do(method, monkeypatch):
+    model, scene, normals, truth = make_scene(8)
+    start = perturbed(truth, 8, degrees=6, shift=0.04)
+    object_mask, scene_mask = (jnp.arange(len(points)) % 7 != 3 for points in (model, scene))
+    poses, inliers = [], []
+    for few in (2**20, 0):
+        monkeypatch.setattr(_icp, "_FEW_DISTANCES", few)
+        run = jax.jit(_icp._icp.__wrapped__, static_argnums=7)
+        result = run(
+            model, scene, start, jnp.float32(DIAMETER), normals, object_mask, scene_mask, IcpConfig(method=method)
+        )
+        assert result.converged
+        poses.append(np.asarray(result.T_scene_object))
+        inliers.append(np.asarray(result.inlier_mask))
+    np.testing.assert_allclose(poses[0], poses[1], atol=2e-4 * DIAMETER)
+    assert (inliers[0] != inliers[1]).mean() < 0.005
+    assert not inliers[1][~np.asarray(scene_mask)].any()
