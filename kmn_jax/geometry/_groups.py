@@ -52,9 +52,9 @@ def nearest_within(
 ) -> tuple[Int[Array, "b q"], Float[Array, "b q"]]:
     """Return for each query the row of its nearest point and the distance, infinite where none is within reach.
 
-    Exactly what all distances say; of equally near points, the lowest row. On CPUs it is the faster the closer together
-    the queries of a block are: best as `group_points` has put them, wherever they have moved as one since. Queries where
-    `mask` is false must be finite, and their result means nothing.
+    Exactly what all distances say; of equally near points, the lowest row. On CPUs it is faster the closer together
+    the queries of a block are: best as `group_points` put them, wherever they moved as one since. Queries where `mask`
+    is false must be finite, and their result means nothing.
     """
     rows, squares = jax.lax.platform_dependent(
         queries, mask, groups, jnp.asarray(reach, dtype=jnp.float32), cpu=_of_near_groups, default=_of_all
