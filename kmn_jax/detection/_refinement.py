@@ -3,6 +3,9 @@
 Parts that are nearly symmetric are found the wrong way round, as few points tell. So each found pose is compared with
 its turns by quarters and halves about the part's main axes. Those that the depth image does not clearly speak against,
 once roughly refined, are refined as the pose itself is.
+
+What is refined is the surface that faces the sensor at the pose and that the rest of the part does not hide: measured
+points near a thin wall would else be drawn to both of its sides.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ from kmn_jax.geometry import (
     with_normals,
 )
 from kmn_jax.pose import IcpConfig, icp
-from kmn_jax.simulate import Surfels
+from kmn_jax.simulate import SplatConfig, Surfels, visible_by_splatting
 from kmn_jax.typing import Pose, PRNGKey, Scalar
 
 ALTERNATIVES = 2  # turned poses that are refined, too
@@ -40,10 +43,11 @@ _ALIKE = 0.3  # cosine of normals, for a point that may lie on a pose's surface
 _CROP_POINTS, _NORMALS = 2048, 768  # around the pose's seed, and of these with normals
 _NORMAL_RADIUS = 0.06  # diameters, of normals without smoothing
 _REACH = 0.1  # diameters, between points and the pose's surface
-_ICP, _ICP_POINTS, _OBJECT_POINTS = IcpConfig(iterations=15), 256, 512
+_SURFELS = 512  # of the part, which are refined, and by which turns are compared with the depth image and the crop
+_SIGHT = SplatConfig(resolution=64)  # of the part alone
+_ICP, _ICP_POINTS = IcpConfig(iterations=15), 256
 _ROUGH_TURNS = 4  # the best turns as they are, which are roughly refined
 _ROUGH_ICP, _ROUGH_POINTS = IcpConfig(iterations=6, distance_gate=0.2), 128
-_ROUGH_SURFELS = 512  # by which turns are compared with the depth image and the crop
 _RAW_TOLERANCE = 0.1  # diameters, of depths, for turns as they are: the pose is not exact
 _TOLERANCE = 0.05  # the same, once they are roughly refined
 
@@ -62,10 +66,7 @@ def refined_forms(
     Poses are in the camera's frame. The first form is the pose itself.
     """
     surfels, diameter = part.surfels, part.arrays.diameter
-    many, few = (
-        Surfels(surfels.points[:count], surfels.normals[:count], surfels.area)
-        for count in (_OBJECT_POINTS, _ROUGH_SURFELS)
-    )
+    few = Surfels(surfels.points[:_SURFELS], surfels.normals[:_SURFELS], surfels.area)
     place = jnp.arange(_NORMALS, dtype=jnp.int32)
     chosen = even_rows(place, jnp.maximum(crop.mask.sum(dtype=jnp.int32), _NORMALS), _NORMALS)
     mask = crop.mask[chosen]
@@ -78,20 +79,23 @@ def refined_forms(
         seen = depth_agreement(pose, few, image, diameter, replace(agreement, tolerance=tolerance))
         return seen.explained - seen.violated
 
-    def refined(pose: Pose, surface: Surfels, count: int, settings: IcpConfig) -> Pose:
+    def refined(pose: Pose, count: int, settings: IcpConfig) -> Pose:
+        seen = visible_by_splatting(few, pose[None], jnp.ones(1, dtype=bool), image.camera, None, _SIGHT).mask
         to_object = inverse(pose)
-        row, distance = nearest(transform_points(to_object, shown), few.points)
+        row, distance = nearest(transform_points(to_object, shown), few.points, seen)
         turned = jnp.matmul(normals, to_object[:3, :3].T, precision=jax.lax.Precision.HIGHEST)
         cosine = (turned * few.normals[row]).sum(axis=1)
         rows, there = spread_rows(mask & (distance <= _REACH * diameter) & (cosine > _ALIKE), count)
         fine = icp(
-            surface.points,
+            few.points,
             shown[rows],
             pose,
             diameter,
             scene_normals=normals[rows],
+            object_mask=seen,
             scene_mask=there,
             config=settings,
+            object_normals=few.normals,
         )
         return fine.T_scene_object
 
@@ -103,7 +107,7 @@ def refined_forms(
 
     def roughly_refined(start: Pose, is_rival: Bool[Array, ""]) -> tuple[Pose, Scalar]:
         def both() -> tuple[Pose, Scalar]:
-            rough = refined(start, few, _ROUGH_POINTS, _ROUGH_ICP)
+            rough = refined(start, _ROUGH_POINTS, _ROUGH_ICP)
             return rough, score(rough, _TOLERANCE)
 
         return jax.lax.cond(is_rival, both, lambda: (start, unlikely))
@@ -114,7 +118,7 @@ def refined_forms(
     there = jnp.concatenate([jnp.ones(1, dtype=bool), best >= score(pose, _TOLERANCE) - margin])
 
     def finish(start: Pose, there: Bool[Array, ""]) -> Pose:
-        return jax.lax.cond(there, lambda: refined(start, many, _ICP_POINTS, _ICP), lambda: start)
+        return jax.lax.cond(there, lambda: refined(start, _ICP_POINTS, _ICP), lambda: start)
 
     return map_rows(finish, jnp.concatenate([pose[None], rough[rows]]), there), there
 

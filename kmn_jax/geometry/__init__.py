@@ -4,6 +4,7 @@ from kmn_jax.geometry._ball_normals import normals_within_radius
 from kmn_jax.geometry._camera import Camera, Intrinsics, intrinsics, measured_points
 from kmn_jax.geometry._crops import Crop, PaddedCloud, crop_around, draw_rows, even_rows, pad_cloud, spread_rows
 from kmn_jax.geometry._eigen import dominant_eigenvector
+from kmn_jax.geometry._groups import PointGroups, group_points, nearest_within
 from kmn_jax.geometry._knn import (
     first_smallest,
     k_nearest,
@@ -38,6 +39,7 @@ __all__ = [
     "Crop",
     "Intrinsics",
     "PaddedCloud",
+    "PointGroups",
     "SmoothConfig",
     "compose",
     "crop_around",
@@ -51,6 +53,7 @@ __all__ = [
     "first_smallest",
     "from_quaternion_translation",
     "from_rotation_translation",
+    "group_points",
     "intrinsics",
     "inverse",
     "k_nearest",
@@ -58,6 +61,7 @@ __all__ = [
     "matrix_to_quaternion",
     "measured_points",
     "nearest",
+    "nearest_within",
     "neighbor_graph",
     "normals_within_radius",
     "orient_to_camera",

@@ -15,8 +15,11 @@ from kmn_jax.geometry import (
     compose,
     from_quaternion_translation,
     from_rotation_translation,
+    group_points,
     inverse,
     nearest,
+    nearest_within,
+    rotate_vectors,
     transform_points,
 )
 from kmn_jax.pose._kabsch import fit_rigid, rotation_is_determined
@@ -25,6 +28,8 @@ from kmn_jax.typing import ArrayInput, Mask, Normals, Points, Pose, Scalar
 
 _MIN_PAIRS = 6  # equations that fix a pose when each pair gives one
 _DIVERGED = 0.01  # of the squared gate: a cost that grows by less is noise about the optimum
+_FEW_DISTANCES = 2**20  # up to which all of them take CPUs less time than groups
+_ALIKE = 0.3  # cosine of normals: pairs of less are of two surfaces
 _DAMPING = 1e-5  # of the mean diagonal: directions that no pair constrains stay where they are
 
 
@@ -78,13 +83,16 @@ def icp(
     object_mask: ArrayInput | None = None,
     scene_mask: ArrayInput | None = None,
     config: IcpConfig = IcpConfig(),
+    *,
+    object_normals: ArrayInput | None = None,
 ) -> PoseResult:
     """Refine an initial T_scene_object (4, 4) so that object points (m, 3) meet scene points (n, 3).
 
     Every scene point is paired with its nearest object point, not the other way round, as the object has
     points that the camera did not see. Point to plane measures along the scene's normals (n, 3), which it needs.
-    Rows where a mask is false are padding. Directions that the geometry leaves open, such as sliding along a
-    single plane, keep their initial value.
+    With normals of the object (m, 3), too, pairs whose normals disagree are left out, as of the two sides of a thin
+    wall. Rows where a mask is false are padding; the object's may also leave out what cannot be seen. Directions that
+    the geometry leaves open, such as sliding along a single plane, keep their initial value.
 
     A refinement returns a usable pose even when it fails, other than a search: with `converged` false it is the
     initial one (status NO_OVERLAP, DEGENERATE or DIVERGED) or the last and better one (ITERATION_LIMIT). A start
@@ -110,10 +118,15 @@ def icp(
     ]
     if object_count == 0 or scene_count == 0:
         raise InputError(f"{object_count} object points and {scene_count} scene points given: both must be some")
+    if object_normals is not None and scene_normals is None:
+        raise InputError("object_normals is given without scene_normals to compare it with: give both")
     if scene_normals is None:
         scene_normals = jnp.zeros((scene_count, 3), dtype=jnp.float32)
     arrays.append(float_array(scene_normals, "scene_normals", (scene_count, 3), mask=scene_rows))
-    return _icp(*(array.astype(jnp.float32) for array in arrays), object_mask, scene_mask, config)
+    if object_normals is not None:
+        object_normals = float_array(object_normals, "object_normals", (object_count, 3), mask=object_rows)
+        object_normals = object_normals.astype(jnp.float32)
+    return _icp(*(array.astype(jnp.float32) for array in arrays), object_mask, scene_mask, object_normals, config)
 
 
 @partial(jax.jit, static_argnames="config")
@@ -125,6 +138,7 @@ def _icp(
     scene_normals: Normals,
     object_mask: Bool[Array, " m"],
     scene_mask: Mask,
+    object_normals: Float[Array, "m 3"] | None,
     config: IcpConfig,
 ) -> PoseResult:
     valid = jnp.isfinite(T_scene_object).all() & jnp.isfinite(object_diameter) & (object_diameter > 0)
@@ -146,6 +160,23 @@ def _icp(
     num_scene = jnp.maximum(scene_mask.sum(dtype=jnp.int32), 1).astype(jnp.float32)
     gate = config.distance_gate
 
+    place = jnp.arange(scene.shape[0], dtype=jnp.int32)
+    grouped = scene.shape[0] * model.shape[0] > _FEW_DISTANCES
+    if grouped:
+        groups, blocks = group_points(model, object_mask), group_points(scene, scene_mask)
+        # The pose moves all scene points as one: blocks of them that lie together stay together.
+        place = (
+            jnp.zeros_like(place)
+            .at[jnp.where(blocks.mask, blocks.rows, scene.shape[0]).reshape(-1)]
+            .set(jnp.arange(blocks.rows.size, dtype=jnp.int32), mode="drop")
+        )
+
+    def nearest_of_object(local: Points) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
+        if not grouped:
+            return nearest(local, model, object_mask)
+        rows, distances = nearest_within(local[blocks.rows], blocks.mask, groups, gate)
+        return rows.reshape(-1)[place], distances.reshape(-1)[place]
+
     def residuals(pairs_moved: Points) -> Float[Array, " n"]:
         difference = pairs_moved - scene
         if config.method == "point_to_plane":
@@ -153,10 +184,14 @@ def _icp(
         return jnp.sqrt((difference**2).sum(axis=1))
 
     def find_pairs(pose: Pose) -> _Pairs:
-        index, distance = nearest(transform_points(inverse(pose), scene), model, object_mask)
+        index, distance = nearest_of_object(transform_points(inverse(pose), scene))
         moved = transform_points(pose, model[index])
         inside = scene_mask & (distance <= gate)
+        # Of all pairs within the gate: one that is left out must not weigh more than one that fits badly.
         cost = jnp.where(inside, residuals(moved) ** 2, gate**2)
+        if object_normals is not None:
+            turned = rotate_vectors(pose, object_normals[index])
+            inside = inside & ((turned * normals).sum(axis=1) > _ALIKE)
         return _Pairs(moved, model[index], inside, distance**2, jnp.where(scene_mask, cost, 0).sum() / num_scene)
 
     def iterate(state: _State) -> _State:

@@ -16,13 +16,14 @@ from kmn_jax.objects import ObjectConfig, Part, PartArrays, object_from_mesh
 from kmn_jax.objects._symmetry import rotation_about
 from kmn_jax.pose import mssd
 from kmn_jax.simulate import RayMesh, Surfels, render
-from tests.reference.meshes import Mesh, bracket, camera_scene, notched_box, pose, random_rotations
+from tests.reference.meshes import Mesh, bracket, camera_scene, notched_box, pose, random_rotations, tube
 from tests.reference.parts import box_part
 
 pytestmark = pytest.mark.usefixtures("few_optimisations")
 
 CAMERA = Camera(500.0, 500.0, 159.5, 119.5, 320, 240)
 TRUE = pose((0.05, -0.02, 3.0), random_rotations(1, 5)[0])
+FORMS = jax.jit(refined_forms, static_argnames=("smooth", "agreement", "margin"))
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +55,11 @@ def turns_of(part: Part) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    depth = render(RayMesh(*notched_box()), camera_scene([TRUE], CAMERA)).depth.astype(np.float32)
+    return view_of(notched_box(), TRUE)
+
+
+def view_of(mesh: Mesh, T_camera_object: np.ndarray) -> Scene:
+    depth = render(RayMesh(*mesh), camera_scene([T_camera_object], CAMERA)).depth.astype(np.float32)
     points = measured_points(depth, CAMERA)
     return make_scene(Scan(points, None, depth, CAMERA, "m"), 1.0, inside=np.ones(len(points), dtype=bool))
 
@@ -78,24 +83,41 @@ def test_rivals_look_nearly_the_same_but_not_quite(part: Part) -> None:
     assert 23 - turns_of(box_part(2000, rotations=symmetries))[1].sum() >= 3
 
 
-def test_turned_poses_come_back(part: Part, scene: Scene) -> None:
-    turns, is_rival = turns_of(part)
-    shift = np.eye(4, dtype=np.float32)
-    shift[:3, 3] = 0.03
-    starts = np.stack([TRUE @ shift, *(TRUE @ turn @ shift for turn in turns[is_rival])]).astype(np.float32)
+def forms_of(part: Part, scene: Scene, starts: np.ndarray, is_rival: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the refined forms of each start, and which of them there are."""
+    turns, _ = turns_of(part)
     seed = jnp.int32(len(scene.points) // 2)
     surfels = Surfels(jnp.asarray(part.points), jnp.asarray(part.normals), jnp.float32(part.area))
     diameter = jnp.float32(part.diameter)
     arrays = PartArrays(surfels.points, surfels.normals, jnp.zeros((8, 4)), diameter)
     on_device = DevicePart(arrays, surfels, jnp.eye(4)[None], jnp.float32(0), jnp.asarray(turns), jnp.asarray(is_rival))
     crop = crop_around(jax.random.key(0), scene.cloud, seed, diameter, 2048, 1)
-    forms = jax.jit(refined_forms, static_argnames=("smooth", "agreement", "margin"))
-    given = (crop, on_device, scene.image)
     settings = {"smooth": SmoothConfig(), "agreement": DepthAgreementConfig(), "margin": 2.0}
-    results = [forms(jnp.asarray(start), *given, **settings) for start in starts]
+    results = [FORMS(jnp.asarray(start), crop, on_device, scene.image, **settings) for start in starts]
     found, there = (np.stack(leaves) for leaves in zip(*results, strict=True))
+    return found, there
+
+
+def test_turned_poses_come_back(part: Part, scene: Scene) -> None:
+    turns, is_rival = turns_of(part)
+    shift = np.eye(4, dtype=np.float32)
+    shift[:3, 3] = 0.03
+    starts = np.stack([TRUE @ shift, *(TRUE @ turn @ shift for turn in turns[is_rival])]).astype(np.float32)
+    found, there = forms_of(part, scene, starts, is_rival)
     errors = np.array([[float(mssd(T, TRUE.astype(np.float32), part.points[:300])) for T in row] for row in found])
     assert errors[0, 0] < 0.02 * part.diameter  # the right one stays, refined
     best = np.where(there, errors, np.inf).min(axis=1)
     assert (best < 0.05 * part.diameter).mean() >= 0.75
     assert np.isfinite(found).all()
+
+
+def test_a_pipe_is_not_drawn_to_its_bore() -> None:
+    wall = 0.03
+    mesh = tube(0.25, wall, 0.8)
+    pipe, lying = of_mesh(mesh), pose((0.05, -0.02, 3.0), np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
+    inwards = (pipe.points[:, :2] * pipe.normals[:, :2]).sum(axis=1) < -0.1
+    assert inwards[:512].mean() > 0.3  # there is a bore that points may be drawn to
+    starts = np.tile(lying.astype(np.float32), (3, 1, 1))
+    starts[:, 2, 3] += [-0.02, 0.02, 0.04]
+    found, _ = forms_of(pipe, view_of(mesh, lying), starts, np.zeros(23, dtype=bool))
+    assert np.abs(found[:, 0, 2, 3] - lying[2, 3]).max() < wall / 6

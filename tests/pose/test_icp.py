@@ -13,7 +13,7 @@ from kmn_jax.geometry import (
     rotate_vectors,
     transform_points,
 )
-from kmn_jax.pose import IcpConfig, PoseStatus, icp
+from kmn_jax.pose import IcpConfig, PoseStatus, _icp, icp
 
 DIAMETER = 50.0
 METHODS = ["point_to_plane", "point_to_point"]
@@ -221,3 +221,42 @@ def test_what_fixes_no_pose_is_no_success(case: str) -> None:
     result = icp(points, scene, np.eye(4), 3.0, scene_normals)
     assert not bool(result.converged)
     np.testing.assert_array_equal(result.T_scene_object, np.eye(4))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_many_points_end_where_all_distances_do(method, monkeypatch):
+    model, scene, normals, truth = make_scene(8)
+    start = perturbed(truth, 8, degrees=6, shift=0.04)
+    object_mask, scene_mask = (jnp.arange(len(points)) % 7 != 3 for points in (model, scene))
+    poses, inliers = [], []
+    for few in (2**20, 0):
+        monkeypatch.setattr(_icp, "_FEW_DISTANCES", few)
+        run = jax.jit(_icp._icp.__wrapped__, static_argnums=8)
+        result = run(
+            model, scene, start, jnp.float32(DIAMETER), normals, object_mask, scene_mask, None, IcpConfig(method=method)
+        )
+        assert result.converged
+        poses.append(np.asarray(result.T_scene_object))
+        inliers.append(np.asarray(result.inlier_mask))
+    np.testing.assert_allclose(poses[0], poses[1], atol=2e-4 * DIAMETER)
+    assert (inliers[0] != inliers[1]).mean() < 0.005
+    assert not inliers[1][~np.asarray(scene_mask)].any()
+
+
+def test_the_far_side_of_a_thin_wall_is_no_partner():
+    generator = np.random.default_rng(0)
+    side = np.c_[generator.uniform(-20, 20, size=(300, 2)), np.zeros(300)].astype(np.float32)
+    up = np.tile(np.float32([[0, 0, 1]]), (300, 1))
+    wall = np.float32([[0, 0, 2]])
+    plate, directions = np.concatenate([side, side - wall]), np.concatenate([up, -up])
+    start = np.eye(4, dtype=np.float32)
+    start[2, 3] = 2
+    drawn = icp(plate, side, start, DIAMETER, up)
+    np.testing.assert_allclose(drawn.T_scene_object[2, 3], 2, atol=0.05)  # its far side lies on the scene
+    right = icp(plate, side, start, DIAMETER, up, object_normals=directions)
+    assert not right.converged  # of a start whose every partner disagrees
+    seen = icp(plate, side, start, DIAMETER, up, object_mask=directions[:, 2] > 0, object_normals=directions)
+    assert seen.converged
+    np.testing.assert_allclose(seen.T_scene_object[2, 3], 0, atol=0.05)
+    with pytest.raises(InputError, match="object_normals is given without"):
+        icp(plate, side, start, DIAMETER, config=IcpConfig(method="point_to_point"), object_normals=directions)

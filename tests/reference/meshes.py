@@ -36,6 +36,23 @@ def notched_box() -> Mesh:
     return _prism(outline, [[3, 4, 5], [3, 5, 0], [3, 0, 1], [3, 1, 2]])
 
 
+def tube(radius: float, wall: float, length: float, sides: int = 48) -> Mesh:
+    """Return a pipe along z that is open at both ends; wound outwards."""
+    angle = np.arange(sides) * 2 * np.pi / sides
+    circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(sides)])
+    half = np.array([0, 0, length / 2])
+    # Once around the wall's section: outside below and above, inside above and below.
+    rings = [radius * circle - half, radius * circle + half]
+    rings += [(radius - wall) * circle + half, (radius - wall) * circle - half]
+    here, after = np.arange(sides), (np.arange(sides) + 1) % sides
+    quads = [
+        (here + i * sides, after + i * sides, after + j * sides, here + j * sides)
+        for i, j in zip(range(4), (1, 2, 3, 0), strict=True)
+    ]
+    faces = [np.column_stack([a, *pair]) for a, b, c, d in quads for pair in ((b, c), (c, d))]
+    return np.concatenate(rings), np.concatenate(faces).astype(np.int32)
+
+
 def _prism(outline: np.ndarray, cap: list[list[int]]) -> Mesh:
     """Return a hexagon in x and z with the triangles of its face, 0.3 thick along y."""
     sides = [np.column_stack([outline[:, 0], np.full(6, y), outline[:, 1]]) for y in (-0.15, 0.15)]
