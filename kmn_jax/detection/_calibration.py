@@ -38,9 +38,9 @@ class CalibrationArrays(NamedTuple):
 
     def logits(self, evidence: Float[Array | np.ndarray, "*s f"], xp: ModuleType = jnp) -> Any:
         """Return the log odds that poses are right, by the functions of jax.numpy or numpy."""
-        clipped = xp.clip(evidence, self.low, self.high)
-        hidden = xp.tanh(clipped @ self.hidden_weights + self.hidden_bias)
-        return clipped @ self.weights + hidden @ self.hidden_slopes + self.bias
+        rows = xp.clip(evidence.reshape(-1, len(self.low)), self.low[None], self.high[None])
+        hidden = xp.tanh(rows @ self.hidden_weights + self.hidden_bias[None])
+        return (rows @ self.weights + hidden @ self.hidden_slopes + self.bias).reshape(evidence.shape[:-1])
 
 
 @dataclass(frozen=True)
@@ -94,12 +94,14 @@ def fit_calibration(
         raise InputError(
             f"{int(right.sum())} of {len(right)} poses are right: to fit probabilities, some must be wrong"
         )
-    low, high = np.percentile(evidence.astype(np.float64), (_EXTREME, 100 - _EXTREME), axis=0)
+    counts = np.ones(len(right)) if weights is None else weights
+    low, high = np.percentile(
+        evidence.astype(np.float64), (_EXTREME, 100 - _EXTREME), axis=0, weights=counts, method="inverted_cdf"
+    )
     clipped = np.clip(evidence.astype(np.float64), low, high)
     mean, scale = clipped.mean(axis=0), clipped.std(axis=0)
     scale = np.where(scale > 0, scale, 1)
     columns = (clipped - mean) / scale
-    counts = np.ones(len(right)) if weights is None else weights
     counts = counts / counts.sum()
     f, u = columns.shape[1], hidden_units
     shapes = ((f, u), (u,), (u,), (f,), ())

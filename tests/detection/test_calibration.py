@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from kmn_jax.detection import (
     Calibration,
+    CalibrationArrays,
     Probabilities,
+    device_calibration,
     expected_calibration_error,
     fit_calibration,
     load_probabilities,
@@ -31,7 +36,7 @@ def drawn(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_a_known_model_is_found_and_its_probabilities_hold() -> None:
     evidence, right = drawn(20_000)
-    fitted = fit_calibration(evidence, right, NAMES)
+    fitted = fit_calibration(evidence, right, NAMES, hidden_units=0)
     np.testing.assert_allclose(fitted.weights[:2], [2, -0.3], rtol=0.1)
     np.testing.assert_allclose(fitted.bias + fitted.weights[2], 1, atol=0.15)
     assert expected_calibration_error(fitted.probability(evidence), right) < 0.02
@@ -43,18 +48,35 @@ def test_a_weight_counts_a_pose_several_times() -> None:
     twice = np.concatenate([evidence, evidence[:100]]), np.concatenate([right, right[:100]])
     weights = np.where(np.arange(500) < 100, 2.0, 1.0)
     # Columns are scaled by the spread of what is given, so the ridge differs a little.
-    weighted, repeated = fit_calibration(evidence, right, NAMES, weights), fit_calibration(*twice, NAMES)
+    weighted, repeated = (
+        fit_calibration(*given, hidden_units=0) for given in ((evidence, right, NAMES, weights), (*twice, NAMES))
+    )
     np.testing.assert_allclose(weighted.probability(evidence), repeated.probability(evidence), atol=0.01)
 
 
-def test_a_column_speaks_only_the_way_it_may() -> None:
+def test_hidden_units_learn_what_depends_on_another_number() -> None:
+    rng = np.random.default_rng(1)
+    evidence = rng.uniform(-1, 1, (3_000, 2)).astype(np.float32)
+    right = evidence.prod(axis=1) > 0
+    plain, hidden = (fit_calibration(evidence, right, ("a", "b"), hidden_units=units) for units in (0, 8))
+    assert ((plain.probability(evidence) > 0.5) == right).mean() < 0.7
+    assert ((hidden.probability(evidence) > 0.5) == right).mean() > 0.9
+    assert fit_calibration(evidence, right, ("a", "b")) == hidden
+
+
+def test_what_was_never_seen_counts_as_the_most_extreme_that_was() -> None:
     evidence, right = drawn(2_000)
-    free = fit_calibration(evidence, right, NAMES)
-    allowed = fit_calibration(evidence, right, NAMES, signs={"first": 1, "second": -1})
-    np.testing.assert_allclose(allowed.probability(evidence), free.probability(evidence), atol=1e-4)
-    forbidden = fit_calibration(evidence, right, NAMES, signs={"first": -1, "second": -1})
-    assert forbidden.weights[0] == 0
-    assert forbidden.weights[1] < 0
+    fitted = fit_calibration(evidence, right, NAMES)
+    far = np.array([[100.0, 3.0, 1.0], [1e6, 3.0, 1.0]], dtype=np.float32)
+    first, second = fitted.probability(far)
+    assert first == second == fitted.probability(np.array([[fitted.high[0], 3.0, 1.0]]))[0]
+
+
+def test_the_device_gives_the_same_probabilities() -> None:
+    evidence, right = drawn(500)
+    fitted = fit_calibration(evidence, right, NAMES)
+    logits = jax.jit(CalibrationArrays.logits)(device_calibration(fitted), jnp.asarray(evidence))
+    np.testing.assert_allclose(jax.nn.sigmoid(logits), fitted.probability(evidence), atol=1e-5)
 
 
 def test_evidence_that_decides_completely_keeps_finite_weights() -> None:
@@ -75,12 +97,25 @@ def test_reliability_counts_every_pose_once() -> None:
 
 def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.calibration.json"
-    fitted = Probabilities(Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25), Calibration(NAMES, (0.0, 1.0, 2.0), -3.0))
+    fitted = Probabilities(Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25), fit_calibration(*drawn(100), NAMES))
     path.write_bytes(probabilities_bytes(fitted))
     assert load_probabilities(path, NAMES) == fitted
     with pytest.raises(InputError, match="of other evidence"):
         load_probabilities(path, ("first",))
-    for content in ("", "[]", "{}", '{"found": 1, "refined": {"names": ["first"], "weights": ["x"], "bias": 0}}'):
+    for content in (
+        "",
+        "[]",
+        "{}",
+        '{"found": 1, "refined": {"names": ["first"], "weights": ["x"], "bias": 0}}',
+        _damaged(fitted),
+    ):
         path.write_text(content)
         with pytest.raises(InputError, match="not a readable calibration"):
             load_probabilities(path, ("first",))
+
+
+def _damaged(fitted: Probabilities) -> str:
+    """Return a file whose hidden units lack a number."""
+    stored = json.loads(probabilities_bytes(fitted))
+    del stored["refined"]["hidden_weights"][3][-1]
+    return json.dumps(stored)

@@ -116,7 +116,7 @@ def test_candidates_are_finite_and_those_of_their_seed(model: Model, part: Devic
     evidence = dict(zip(EVIDENCE, found.evidence.T, strict=True))
     total = sum(evidence[name] for name in ("explained", "violated", "occluded", "unknown"))
     assert ((np.abs(total - 1) < 1e-3) | (total == 0)).all()  # nothing of a pose behind the sensor is visible
-    for name in set(EVIDENCE) - {"log_inliers", "straight", "surface"}:
+    for name in set(EVIDENCE) - {"log_inliers", "straight", "surface", "log_cells", "log_area", "offset"}:
         assert (evidence[name] >= 0).all(), name
         assert (evidence[name] <= 1.001).all(), name
     assert (np.abs(evidence["surface"]) <= 3).all()

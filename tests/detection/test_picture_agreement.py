@@ -1,0 +1,172 @@
+"""Pictures of boxes, plates and rings before a wall, in it and half hidden."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kmn_jax.detection import DepthImage, PictureAgreement, picture_agreement
+from kmn_jax.geometry import intrinsics
+from kmn_jax.simulate import Surfels
+from tests.detection.box_sample import CAMERA, POSES, SIZES, WALL, box_part, box_view
+from tests.reference.meshes import pose
+
+PART = box_part()
+SURFELS = Surfels(jnp.asarray(PART.points), jnp.asarray(PART.normals), jnp.float32(PART.area))
+NO_SHARES = ("offset", "log_cells", "log_area", "deviation", "noise")
+compare = jax.jit(picture_agreement)
+
+
+@pytest.fixture(scope="module")
+def depth() -> jax.Array:
+    image = box_view().depth
+    assert image is not None
+    return jnp.asarray(image)
+
+
+def of(T: np.ndarray, depth: jax.Array) -> PictureAgreement:
+    found: PictureAgreement = compare(
+        jnp.asarray(T, dtype=jnp.float32),
+        SURFELS,
+        DepthImage(depth, intrinsics(CAMERA)),
+        jnp.float32(PART.diameter),
+    )
+    assert np.isfinite(np.array(found)).all()
+    for name in set(found._fields) - set(NO_SHARES):
+        assert 0 <= getattr(found, name) <= 1 + 1e-6, name
+    assert found.open + found.level + found.fronted <= 1 + 1e-6
+    return found
+
+
+def test_beyond_a_box_before_a_wall_is_the_wall(depth: jax.Array) -> None:
+    for T in POSES:
+        assert of(T, depth).open > 0.95
+
+
+def test_a_wall_goes_on_beyond_a_box_sunk_into_it(depth: jax.Array) -> None:
+    found = of(pose((0.0, 0.0, WALL + SIZES[2] / 2)), jnp.full_like(depth, WALL))
+    assert found.level > 0.95
+    assert found.open == 0
+
+
+def test_a_pose_half_on_a_box_is_open_there_only(depth: jax.Array) -> None:
+    # Moved by half its length along y: one of its sides lies on the box.
+    found = of(POSES[0] @ pose((0.0, SIZES[1] / 2, 0.0)), depth)
+    on_box = SIZES[0] / (2 * SIZES[0] + 2 * SIZES[1])
+    assert abs(found.level - on_box) < 0.06
+    assert abs(found.open - (1 - on_box)) < 0.06
+
+
+def test_what_is_hidden_counts_for_neither_and_what_was_not_measured_is_open(depth: jax.Array) -> None:
+    hidden, unmeasured = of(POSES[0], jnp.full_like(depth, 1.0)), of(POSES[0], jnp.zeros_like(depth))
+    assert (hidden.open, hidden.level, hidden.fronted, hidden.near) == (0, 0, 1, 0)
+    assert (unmeasured.open, unmeasured.level, unmeasured.stepped, unmeasured.near) == (1, 0, 0, 0)
+    left = np.arange(depth.shape[1]) < CAMERA.cx + CAMERA.fx * POSES[0][0, 3] / (POSES[0][2, 3] - SIZES[2] / 2)
+    assert abs(of(POSES[0], jnp.where(jnp.asarray(left)[None], depth, 1.0)).open - 0.5) < 0.06
+    assert of(POSES[0], jnp.where(jnp.asarray(left)[None], depth, 0)).open > 0.95
+
+
+def test_a_pose_behind_the_sensor_or_outside_of_the_image_has_no_outline(depth: jax.Array) -> None:
+    for T in (pose((0.0, 0.0, -3.0)), pose((9.0, 0.0, 3.0))):
+        found = of(T, depth)
+        assert (found.open, found.level, found.near) == (0, 0, 0)
+    tiny = of(pose((0.0, 0.0, 200.0)), jnp.full_like(depth, 300.0))  # the box is less than a pixel large
+    assert (tiny.open, tiny.level) == (1, 0)
+
+
+def test_a_sparse_image_of_a_wall_is_still_level(depth: jax.Array) -> None:
+    holes = jnp.asarray(np.random.default_rng(0).random(depth.shape) < 0.4)
+    found = of(pose((0.0, 0.0, WALL + SIZES[2] / 2)), jnp.where(holes, 0, WALL))
+    assert found.level > 0.95
+
+
+def test_holes_have_an_outline(depth: jax.Array) -> None:
+    plate = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 60), np.linspace(-0.5, 0.5, 60)), axis=-1).reshape(-1, 2)
+    ring = plate[np.linalg.norm(plate, axis=1) > 0.3]
+    points = np.concatenate([ring, np.zeros((len(ring), 1))], axis=1).astype(np.float32)
+    surfels = Surfels(jnp.asarray(points), jnp.broadcast_to(jnp.array([0.0, 0, -1]), points.shape), jnp.float32(0.7))
+    wall = jnp.full_like(depth, 3.0)
+    through = jnp.where(depth >= 0, wall, 0)
+    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
+    away = np.hypot(columns - CAMERA.cx, rows - CAMERA.cy) / CAMERA.fx * 3
+    hole = jnp.where(jnp.asarray(away) < 0.3, 4.0, through)
+    camera, diameter = intrinsics(CAMERA), jnp.float32(2**0.5)
+    T = jnp.asarray(pose((0.0, 0.0, 3.0)), dtype=jnp.float32)
+    closed, opened = (compare(T, surfels, DepthImage(image, camera), diameter) for image in (through, hole))
+    assert closed.open == 0
+    assert 0.2 < opened.open < 0.5  # two pi 0.3 of it and 4
+
+
+def test_a_box_where_it_was_measured_agrees_in_depth_and_normals(depth: jax.Array) -> None:
+    for T in POSES:
+        right = of(T, depth)
+        assert right.near > 0.8
+        assert right.aligned > 0.8
+        assert right.turned < 0.1
+        assert right.coplanar < 0.05
+        assert right.deviation < 0.015
+        assert abs(right.offset) < 0.005
+        moved = of(T @ pose((0.0, 0.0, 0.1 * PART.diameter)), depth)
+        assert moved.near < 0.3
+    behind = of(POSES[0] @ pose((0.0, 0.0, -0.3 * PART.diameter)), depth)
+    assert max(behind.behind, behind.fronted + 1 - behind.near) > 0.6
+
+
+def plate(normal: tuple[float, float, float] = (0.0, 0.0, -1.0)) -> Surfels:
+    flat = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 45), np.linspace(-0.5, 0.5, 45)), axis=-1).reshape(-1, 2)
+    points = np.concatenate([flat, np.zeros((len(flat), 1))], axis=1).astype(np.float32)
+    return Surfels(jnp.asarray(points), jnp.broadcast_to(jnp.array(normal), points.shape), jnp.float32(1.0))
+
+
+def test_a_plate_in_a_larger_plane_is_told_from_one_that_ends(depth: jax.Array) -> None:
+    camera, diameter, T = intrinsics(CAMERA), jnp.float32(2**0.5), jnp.asarray(pose((0.0, 0.0, 3.0)), jnp.float32)
+    wall = jnp.full_like(depth, 3.0)
+    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
+    x, y = (
+        (place - center) / focal * 3
+        for place, center, focal in ((columns, CAMERA.cx, CAMERA.fx), (rows, CAMERA.cy, CAMERA.fy))
+    )
+    own = jnp.asarray((abs(x) <= 0.5) & (abs(y) <= 0.5))
+    in_wall = compare(T, plate(), DepthImage(wall, camera), diameter)
+    above, on_floor = (
+        compare(T, plate(), DepthImage(jnp.where(own, 3.0, floor), camera), diameter) for floor in (3.3, 3.05)
+    )
+    assert in_wall.near == on_floor.near == above.near == 1
+    assert in_wall.coplanar > 0.9
+    assert above.coplanar == 0
+    # Of a thin sheet, the slope at its edge may be taken for its own.
+    assert on_floor.coplanar < 0.6
+    assert on_floor.stepped > 0.8 > 0.2 > in_wall.stepped
+    assert in_wall.variety < 0.01
+    # Its area in the square of the diameter is a half.
+    assert abs(float(in_wall.log_area) - np.log(0.5)) < 0.15
+
+
+def test_noise_and_turned_normals_are_measured(depth: jax.Array) -> None:
+    camera, diameter, T = intrinsics(CAMERA), jnp.float32(2**0.5), jnp.asarray(pose((0.0, 0.0, 3.0)), jnp.float32)
+    noise = jnp.asarray(np.random.default_rng(0).normal(0, 0.01, depth.shape), jnp.float32)
+    found = compare(T, plate(), DepthImage(3.0 + noise, camera), diameter)
+    assert abs(float(found.noise) * 2**0.5 / 0.01 - 1) < 0.25
+    assert abs(float(found.deviation) * 2**0.5 / 0.01 - 0.5) < 0.25  # of the mean of five
+    slanted = compare(T, plate((0.8, 0.0, -0.6)), DepthImage(jnp.full_like(depth, 3.0), camera), diameter)
+    assert slanted.aligned == 0
+    assert slanted.near == 1
+
+
+def test_a_step_that_is_predicted_and_one_that_is_not(depth: jax.Array) -> None:
+    camera, diameter, T = intrinsics(CAMERA), jnp.float32(2**0.5), jnp.asarray(pose((0.0, 0.0, 3.0)), jnp.float32)
+    flat = plate()
+    stairs = flat._replace(points=flat.points.at[:, 2].set(jnp.where(flat.points[:, 0] > 0, 0.2, 0.0)))
+    columns = jnp.arange(CAMERA.width, dtype=jnp.float32)[None] > CAMERA.cx
+    stepped = jnp.where(columns, 3.2, jnp.full_like(depth, 3.0))
+    both, neither = (
+        compare(T, one, DepthImage(image, camera), diameter)
+        for one, image in ((stairs, stepped), (flat, jnp.full_like(depth, 3.0)))
+    )
+    missing = compare(T, stairs, DepthImage(jnp.full_like(depth, 3.0), camera), diameter)
+    strange = compare(T, flat, DepthImage(stepped, camera), diameter)
+    assert both.edges > 0.4  # cells on both sides of the step, of which some are one off
+    assert (neither.edges, neither.strange_edges, missing.edges) == (0, 0, 0)
+    assert strange.strange_edges > 1.5 * both.strange_edges
