@@ -2,12 +2,13 @@
 
 python -m tests.attack.kills --kills 200 --seed 0 --json FILE [--only training]
 
-Each command first runs without a stop. Then it is killed (SIGKILL) a few times, at its start or while it writes, alone or
-with the processes that it has started; after each kill what it left is looked at, and at last it ends and is compared.
+Each command first runs without a stop. Then it is killed (SIGKILL) a few times, at its start or while it writes, alone
+or with the processes that it has started; after each kill what it left is looked at, at last it ends and is compared.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -176,10 +177,8 @@ def _end(process: subprocess.Popen[bytes], group: bool) -> None:
         process.kill()
         process.wait()
         time.sleep(0.2)  # those that it has started write on for a moment
-    try:
+    with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
-    except ProcessLookupError:
-        pass
     process.wait()
 
 
