@@ -3,8 +3,8 @@
 python -m benchmarks.endurance [--detections 10000] [--hours 1] [--json FILE]
 
 Parts, sizes and sensors change from call to call. Some frames are all NaN, empty, truncated, or show another part: each
-must be told by InputError, or by a result without an accepted pose and with a reason or a probability. What follows must
-be equal to the bit to the same frame's first result.
+must be told by InputError, or by a result without an accepted pose, and with a reason or doubtful ones. What follows
+must be equal to the bit to the same frame's first result.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import signal
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, TimeoutError, wait
 from dataclasses import replace
 from pathlib import Path
@@ -17,14 +17,17 @@ from tests.attack.cases import BYTES, SECONDS, WAIT, Case, Outcome, judge, limit
 _CASES_A_WORKER = 2000  # then a fresh one: readers leak
 
 
-def outcomes(cases: Sequence[Case], workers: int = 2) -> Iterator[Outcome]:
+Judge = Callable[[Case, Path], Outcome]
+
+
+def outcomes(cases: Sequence[Case], workers: int = 2, judged: Judge = judge) -> Iterator[Outcome]:
     """Yield what comes of cases, as they are done. A case over a limit costs its worker only."""
     with tempfile.TemporaryDirectory(prefix="attack-") as folder:
         wholes = whole_folders(Path(folder), dict.fromkeys(case.target for case in cases))
-        yield from _outcomes(cases, workers, wholes)
+        yield from _outcomes(cases, workers, wholes, judged)
 
 
-def _outcomes(cases: Sequence[Case], workers: int, wholes: Path) -> Iterator[Outcome]:
+def _outcomes(cases: Sequence[Case], workers: int, wholes: Path, judged: Judge) -> Iterator[Outcome]:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["tests.attack.cases", "open3d", "trimesh", "OpenEXR", "orbax.checkpoint"])
     queue, pending = iter(cases), dict[Future[Outcome], Case]()
@@ -32,7 +35,7 @@ def _outcomes(cases: Sequence[Case], workers: int, wholes: Path) -> Iterator[Out
         try:
             while True:
                 while len(pending) < 4 * workers and (case := next(queue, None)) is not None:
-                    pending[pool.schedule(judge, (case, wholes), timeout=WAIT)] = case
+                    pending[pool.schedule(judged, (case, wholes), timeout=WAIT)] = case
                 if not pending:
                     return
                 for future in wait(pending, return_when=FIRST_COMPLETED).done:
