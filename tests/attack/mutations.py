@@ -135,6 +135,14 @@ def mutated_tree(content: bytes, random: Random) -> bytes:
     return json.dumps(tree).replace(f'"{_PLACE}"', random.choice(_VALUES)).encode()
 
 
+def mutated_rows(content: bytes, random: Random) -> bytes:
+    """Damage a value of one row of a file that has JSON in each."""
+    rows = content.splitlines() or [b""]
+    row = random.randrange(len(rows))
+    rows[row] = mutated_tree(rows[row], random)
+    return b"\n".join(rows) + b"\n"
+
+
 def _places(tree: Any) -> Any:
     pending = [tree]
     while pending:

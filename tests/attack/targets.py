@@ -16,6 +16,7 @@ from kmn_jax.bop import BopDataset, bop_scan, bop_sizes
 from kmn_jax.data import Pack
 from kmn_jax.detection._calibration import load_probabilities
 from kmn_jax.detection._evidence import EVIDENCE
+from kmn_jax.errors import InputError
 from kmn_jax.io import read_mesh, read_scan
 from kmn_jax.io._meshes import CLOUD_SUFFIXES
 from kmn_jax.io._scans import read_camera
@@ -25,7 +26,14 @@ from kmn_jax.train import read_metrics
 from kmn_jax.train._checkpoint import Checkpoints
 from tests.attack import containers, mutations, samples
 from tests.attack.mutations import Mutation
-from tests.attack.trees import bop_folder, checkpoint_folder, evaluation_folder, pack_folder
+from tests.attack.trees import (
+    bop_folder,
+    checkpoint_folder,
+    evaluation_folder,
+    journal_folder,
+    pack_folder,
+    read_journal,
+)
 
 ROOT = Path(__file__).parents[2]
 
@@ -85,7 +93,8 @@ def _bop(folder: Path, path: Path) -> Any:
 
 def _pack(folder: Path, path: Path) -> Any:
     pack = Pack(folder)
-    assert not pack.problems()
+    for problem in pack.problems():
+        raise InputError(problem)
     return [pack.load(name) for name in pack.names()]
 
 
@@ -142,6 +151,7 @@ def _one(write: Callable[[Path], None], name: str) -> Callable[[Path], None]:
 
 _TEXT = (mutations.mutated_numbers, mutations.mutated_lines)
 _JSON = (mutations.mutated_tree, mutations.mutated_tree, mutations.mutated_numbers)
+_ROWS = (mutations.mutated_rows, mutations.mutated_rows, mutations.mutated_numbers)
 _HEADER = (mutations.mutated_header,)
 _ZIP = (containers.mutated_zip, containers.mutated_zip)
 _TENSORS = (containers.mutated_tensors, containers.mutated_tensors)
@@ -224,6 +234,7 @@ def targets() -> dict[str, Target]:
         Target("pack-manifest", pack_folder, ("manifest.json",), _pack, 0.6, _JSON),
         Target("pack-shard", pack_folder, ("*/*.safetensors",), _pack, 0.8, _TENSORS, _sign_pack),
         Target("checkpoint", checkpoint_folder, ("checkpoints/step-00000020/**/*",), _checkpoint, 0.15, _JSON),
+        Target("pack-journal", journal_folder, ("*",), lambda folder, _: read_journal(folder).records, 0.4, _ROWS),
         Target(
             "checkpoint-signed",
             checkpoint_folder,
@@ -233,7 +244,7 @@ def targets() -> dict[str, Target]:
             _JSON,
             _sign_checkpoint,
         ),
-        Target("metrics", _one(_metrics, "metrics.jsonl"), ("*",), lambda folder, _: read_metrics(folder), 0.3, _JSON),
+        Target("metrics", _one(_metrics, "metrics.jsonl"), ("*",), lambda folder, _: read_metrics(folder), 0.3, _ROWS),
         Target("predictions", evaluation_folder, ("*/*.safetensors",), _predictions, 0.6, _TENSORS),
         Target("recipe", evaluation_folder, ("recipe.json",), _predictions, 0.4, _JSON),
         Target("poses-json", _one(_poses, "a.json"), ("a.json",), lambda _, path: read_poses(path), 0.4, _JSON),

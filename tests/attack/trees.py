@@ -9,8 +9,9 @@ import numpy as np
 
 from experiments.evaluation.cases import Case
 from experiments.evaluation.predictions import Export, Predictions
-from kmn_jax.data import Pack
-from kmn_jax.data._pack import write_manifest, write_object
+from kmn_jax.data import Pack, PackConfig, Record
+from kmn_jax.data._build import _Journal
+from kmn_jax.data._pack import Entry, Shard, write_manifest, write_object
 from kmn_jax.train._checkpoint import Checkpoints
 from tests.bop.bop_sample import write_sample
 
@@ -33,6 +34,19 @@ def pack_folder(folder: Path) -> None:
             replace(item, name=item.digest[:8], points=item.points[:64], normals=item.normals[:64], drops=drops[:2])
         )
     write_manifest(folder, [write_object(folder, item) for item in items])
+
+
+def journal_folder(folder: Path) -> None:
+    """Write the journal of a build with an object that was built and one that was rejected."""
+    journal = read_journal(folder)
+    shard = Shard("objects/one.safetensors", 100, "0" * 64)
+    journal.add(Record("one", "train", 1.5, None, Entry("one", "train", shard, None), {"penetrations": [0.001]}))
+    journal.add(Record("other", "test", 2.5, "it is broken"))
+
+
+def read_journal(folder: Path) -> _Journal:
+    """Read the journal as the next build would."""
+    return _Journal(folder / "journal.jsonl", PackConfig())
 
 
 def checkpoint_folder(folder: Path) -> None:
