@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from experiments.bins import read_targets
 from experiments.evaluation.clouds import read_poses
 from experiments.evaluation.predictions import Export
 from kmn_jax.bop import BopDataset, bop_scan, bop_sizes
@@ -234,6 +235,7 @@ def targets() -> dict[str, Target]:
         Target("pack-manifest", pack_folder, ("manifest.json",), _pack, 0.6, _JSON),
         Target("pack-shard", pack_folder, ("*/*.safetensors",), _pack, 0.8, _TENSORS, _sign_pack),
         Target("checkpoint", checkpoint_folder, ("checkpoints/step-00000020/**/*",), _checkpoint, 0.15, _JSON),
+        Target("bop-targets", targets_folder, ("*.json",), lambda folder, _: read_targets(folder), 0.4, _JSON),
         Target("pack-journal", journal_folder, ("*",), lambda folder, _: read_journal(folder).records, 0.4, _ROWS),
         Target(
             "checkpoint-signed",

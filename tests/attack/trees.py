@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from experiments.evaluation.cases import Case
 from experiments.evaluation.predictions import Export, Predictions
+from experiments.worlds import NAMES, TARGETS
 from kmn_jax.data import Pack, PackConfig, Record
 from kmn_jax.data._build import _Journal
 from kmn_jax.data._pack import Entry, Shard, write_manifest, write_object
@@ -34,6 +36,13 @@ def pack_folder(folder: Path) -> None:
             replace(item, name=item.digest[:8], points=item.points[:64], normals=item.normals[:64], drops=drops[:2])
         )
     write_manifest(folder, [write_object(folder, item) for item in items])
+
+
+def targets_folder(folder: Path) -> None:
+    """Write which objects are asked for in world bins, and the families of their scenes."""
+    rows = [{"scene_id": scene, "im_id": image, "obj_id": 1 + scene} for scene in (0, 1) for image in (0, 1)]
+    (folder / TARGETS).write_text(json.dumps(rows))
+    (folder / NAMES).write_text(json.dumps({"0": "bins", "1": "tables"}))
 
 
 def journal_folder(folder: Path) -> None:
