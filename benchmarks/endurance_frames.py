@@ -58,14 +58,16 @@ def small_frames(parts: dict[str, Part], folder: Path, random: np.random.Generat
 
 def bin_frames(folder: Path) -> list[Frame]:
     """Copy the gear motors' depth images of the small test set, and return searches of all of them and of places."""
-    data, frames = _ASSETS / "small_test_set", []
-    shutil.copyfile(data / "camera.json", folder / "camera.json")
-    truth = json.loads((data / "test" / "000002" / "scene_gt.json").read_text(encoding="utf-8"))
-    for image in sorted((data / "test" / "000002" / "depth").glob("*.png")):
-        scan = Path(shutil.copyfile(image, folder / image.name))
+    data, frames = _ASSETS / "small_test_set" / "test" / "000002", []
+    truth, cameras = (
+        json.loads((data / f"scene_{name}.json").read_text(encoding="utf-8")) for name in ("gt", "camera")
+    )
+    for image in sorted((data / "depth").glob("*.png")):
+        scan, camera = Path(shutil.copyfile(image, folder / image.name)), folder / f"{image.stem}.json"
+        camera.write_text(json.dumps(cameras[str(int(image.stem))]))
         poses = truth[str(int(image.stem))]
         high = min((np.array(pose["cam_t_m2c"]) for pose in poses), key=lambda place: place[2])
-        whole = Frame(f"bin {image.stem}", "gear_motor", scan, None, folder / "camera.json")
+        whole = Frame(f"bin {image.stem}", "gear_motor", scan, None, camera)
         frames += [whole, replace(whole, name=f"place in bin {image.stem}", at=high[None])]
     return frames
 

@@ -71,7 +71,8 @@ def test_frames_can_be_read_and_places_are_in_them(frames: list[Frame]) -> None:
         scan = read_scan(frame.scan, frame.unit, frame.camera)
         if frame.at is not None:
             apart = np.linalg.norm(scan.points - frame.at, axis=1).min()
-            assert apart < 0.02 * np.ptp(scan.points, axis=0).max()
+            # Places in bins are the origins of copies, inside of them.
+            assert apart < (0.02 if frame.camera is None else 0.2) * np.ptp(scan.points, axis=0).max()
 
 
 @pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault != "another part"])
