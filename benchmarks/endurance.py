@@ -9,7 +9,6 @@ must be equal to the bit to the same frame's first result.
 
 from __future__ import annotations
 
-import gc
 import os
 import sys
 import tempfile
@@ -180,8 +179,7 @@ def _bits(found: Detections) -> bytes:
 
 
 def _megabytes() -> float:
-    """Return the memory that the process holds; what Python would free by itself soon is freed first."""
-    gc.collect()
+    """Return the memory that the process holds."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
