@@ -34,6 +34,7 @@ from tests.attack.trees import (
     journal_folder,
     pack_folder,
     read_journal,
+    targets_folder,
 )
 
 ROOT = Path(__file__).parents[2]
