@@ -16,8 +16,12 @@ def misbehave(case: Case, wholes: Path) -> Outcome:
         case 0:
             os.kill(os.getpid(), signal.SIGSEGV)
         case 1:
-            resource.setrlimit(resource.RLIMIT_DATA, (2**20, 2**30))
-            bytearray(2**30)
+            _, most = resource.getrlimit(resource.RLIMIT_DATA)
+            resource.setrlimit(resource.RLIMIT_DATA, (2**20, most))
+            try:
+                bytearray(2**30)
+            finally:
+                resource.setrlimit(resource.RLIMIT_DATA, (most, most))
         case 2:
             signal.setitimer(signal.ITIMER_PROF, 0.01)
             while True:
