@@ -15,14 +15,15 @@ from kmn_jax.errors import InputError
 def only_one(folder: Path) -> Iterator[None]:
     """Hold a run's folder for this process; it is free again however the process ends.
 
-    File systems and platforms without such locks hold nothing. Raises InputError if another process has the folder, or
-    if it cannot be made.
+    File systems and platforms without such locks hold nothing; what is wrong with a folder that cannot be made is told
+    by what writes to it. Raises InputError if another process has the folder.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         handle = os.open(folder, os.O_RDONLY)
-    except OSError as error:
-        raise InputError(f"cannot write {folder}: {error.strerror}") from None
+    except OSError:
+        yield
+        return
     try:
         _lock(handle, folder)
         yield

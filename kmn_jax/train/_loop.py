@@ -15,7 +15,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -103,7 +103,8 @@ def train(
     # By one process, or the others might find what it has just written.
     from_first_process(lambda: _check_free(folder, resume))
     run = _Run(config, folder, data_mesh(), stop, report or _print)
-    with only_one(folder) if run.first else nullcontext():
+    with ExitStack() as held:
+        from_first_process(lambda: held.enter_context(only_one(folder)))
         run.restore()
         with stop:
             return run.loop(progress)

@@ -91,12 +91,3 @@ def test_a_second_process_is_refused_before_it_writes(tmp_path: Path) -> None:
     assert list(folder.iterdir()) == []
     with only_one(folder):  # which is free again
         pass
-
-
-def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with (
-        pytest.raises(InputError, match=r"cannot write .*file/run: Not a directory"),
-        only_one(tmp_path / "file" / "run"),
-    ):
-        pass
