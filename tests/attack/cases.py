@@ -7,6 +7,7 @@ import os
 import resource
 import shutil
 import signal
+import sys
 import tempfile
 import traceback
 from collections.abc import Iterable, Iterator
@@ -89,6 +90,8 @@ def judge(case: Case, wholes: Path) -> Outcome:
         grown = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
         if grown > children:  # the largest of all that ever were
             after = max(after, before + grown)
+        sys.stdout.flush()
+        sys.stderr.flush()
         if kind in GOOD and os.fstat(printed).st_size:
             kind, said = "printed", os.pread(printed, _LONGEST, 0).decode("utf-8", "replace").strip()
     return Outcome(case, kind, said[:_LONGEST], round(seconds, 3), round(after - before, 1), where)
