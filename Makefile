@@ -12,7 +12,7 @@ COMPILE := .venv-lock/bin/uv --no-config pip compile --quiet --generate-hashes -
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test check format bench bench-env docs lock clean
+.PHONY: help demo test check format bench bench-env attack docs lock clean
 
 help: ## list these verbs
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
@@ -34,6 +34,9 @@ format: $(READY) ## format and apply the safe lint fixes
 
 bench: $(READY) ## whether anything is slower than it was, by ratios
 	$(BIN)/python -m benchmarks.gate
+
+attack: $(READY) ## read 20,000 damaged files of every format: about 20 minutes
+	$(BIN)/python -m tests.attack --json outputs/attack.json
 
 bench-env: $(BENCH_READY) ## add PyTorch, for the benchmarks and the tests marked torch
 

@@ -98,18 +98,34 @@ def bin_images(folder: Path, split: str, model: Model, every: int = 1) -> Iterat
         )
 
 
-def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldImage]:
-    """Yield every so many images. Raises InputError if the folder holds no world bins."""
+def read_targets(folder: Path) -> list[tuple[FrameKey, int, str]]:
+    """Return the images of world bins, each with the object that is asked for and the family of its scene.
+
+    Raises InputError if the folder holds no world bins.
+    """
     try:
         targets = json.loads((folder / TARGETS).read_text(encoding="utf-8"))
         names = json.loads((folder / NAMES).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{folder} holds no world bins ({error}): python -m experiments.build_data worlds") from None
+        keys = [FrameKey(int(target["scene_id"]), int(target["im_id"])) for target in targets]
+        objects = [int(target["obj_id"]) for target in targets]
+        return list(zip(keys, objects, [str(names[str(key.scene_id)]) for key in keys], strict=True))
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        reason = str(error)[:80]
+        raise InputError(f"{folder} holds no world bins ({reason}): python -m experiments.build_data worlds") from None
+
+
+def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldImage]:
+    """Yield every so many images. Raises InputError if the folder holds no world bins, or others than its targets."""
+    targets = read_targets(folder)
     dataset, parts = _opened(folder, SPLIT, model)
     kinds = {object_id: kind_of(dataset.model(object_id).name or "") for object_id in parts}
-    keys = {(key.scene_id, key.image_id): key for key in dataset.keys}
-    for target in targets[::every]:
-        key, object_id = keys[target["scene_id"], target["im_id"]], target["obj_id"]
+    keys = set(dataset.keys)
+    for key, object_id, family in targets[::every]:
+        if key not in keys or object_id not in parts:
+            raise InputError(
+                f"{folder} has no object {object_id} or no image {key.image_id} of scene {key.scene_id}, which its"
+                f" {TARGETS} names: python -m experiments.build_data worlds"
+            )
         part = parts[object_id]
         frame = dataset.frame(*key, masks=True).with_visibility()
         yield WorldImage(
@@ -117,7 +133,7 @@ def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldIm
             part,
             _like_in_size(part, [other for number, other in parts.items() if kinds[number] != kinds[object_id]]),
             *_truth(frame.instances or ()),
-            names[str(key.scene_id)],
+            family,
             object_id,
             _scan(frame),
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import traceback
@@ -281,12 +282,18 @@ def _joined(arguments: list[str]) -> list[str]:
 
 
 def _keep_compiled() -> None:
-    """Let JAX keep compiled programs between calls, in the user's cache unless told another place."""
+    """Let JAX keep compiled programs between calls, in the user's cache unless told another place.
+
+    Without a home, or with one that cannot be written to, nothing is kept.
+    """
     import jax
 
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(Path(base) / "kmn_jax"))
+        with contextlib.suppress(OSError, RuntimeError):
+            folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "kmn_jax"
+            folder.mkdir(parents=True, exist_ok=True)
+            if os.access(folder, os.W_OK):
+                jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 

@@ -65,9 +65,9 @@ class Export:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             old = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise InputError(f"{file} cannot be read ({error}): choose another folder with --output") from None
-        if not isinstance(old, dict | None):
+        if not isinstance(old, dict | None) or not isinstance((old or {}).get("methods", {}), dict):
             raise InputError(f"{file} is no recipe: choose another folder with --output")
         if old is not None:
             stale = _differing(old, plain)
@@ -108,24 +108,36 @@ class Export:
         self._write("cases", name, noise, tensors, {key: json.dumps(value) for key, value in texts.items()})
 
     def truth(self, name: str, noise: float) -> Truth:
-        """Read the true poses of cases. Raises InputError if they are not there."""
+        """Read the true poses of cases. Raises InputError if they are not there, or damaged."""
         tensors, metadata = self._read("cases", name, noise)
-        ends = np.cumsum(tensors["counts"])[:-1]
-        return Truth(
-            tuple(json.loads(metadata["names"])),
-            tuple(np.split(tensors["poses"], ends)) if len(tensors["counts"]) else (),
-            tuple(tensors["copy"].tolist()),
-            tensors["visible"],
-            tuple(json.loads(metadata["problems"])),
-        )
+        try:
+            names = tuple(map(str, json.loads(metadata["names"])))
+            problems = tuple(map(str, json.loads(metadata["problems"])))
+            counts, poses = tensors["counts"], tensors["poses"]
+            _check_shapes(tensors, poses=(int(counts.sum()), 4, 4), counts=(len(names),), copy=(len(names),))
+            _check_shapes(tensors, visible=(len(names),))
+            if counts.min(initial=0) < 0:
+                raise ValueError("counts below zero")
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            raise self._damage("cases", name, noise, error) from None
+        split = tuple(np.split(poses, np.cumsum(counts)[:-1])) if len(counts) else ()
+        return Truth(names, split, tuple(tensors["copy"].tolist()), tensors["visible"], problems)
 
     def write(self, method: str, name: str, noise: float, found: Predictions) -> None:
         """Write what a method found."""
         self._write(method, name, noise, found._asdict(), {})
 
     def read(self, method: str, name: str, noise: float) -> Predictions:
-        """Read what a method found. Raises InputError if it is not there."""
-        return Predictions(**self._read(method, name, noise)[0])
+        """Read what a method found. Raises InputError if it is not there, or damaged."""
+        tensors, _ = self._read(method, name, noise)
+        try:
+            found = Predictions(**tensors)
+            cases = (len(found.found),)
+            _check_shapes(tensors, T_camera_object=(*cases, 4, 4), refined=(*cases, 4, 4), found=cases)
+            _check_shapes(tensors, seconds=cases, refine_seconds=cases)
+        except (TypeError, ValueError) as error:
+            raise self._damage(method, name, noise, error) from None
+        return found
 
     def made_at(self, method: str, name: str, noise: float) -> str:
         """Return the commit that a method's poses were made at."""
@@ -147,10 +159,20 @@ class Export:
             raise InputError(f"{path} was made by another recipe: delete it, and evaluate again")
         return tensors, metadata
 
+    def _damage(self, method: str, name: str, noise: float, error: Exception) -> InputError:
+        path = self.path(method, name, noise)
+        return InputError(f"{path} is damaged ({str(error)[:80]}): delete it, and evaluate again")
+
     def _digest(self, method: str) -> str:
         """Return the SHA-256 of all that a method's poses depend on: not the other methods."""
         own = {**self.recipe, "methods": self.recipe.get("methods", {}).get(method)}
         return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()
+
+
+def _check_shapes(tensors: Mapping[str, np.ndarray], **shapes: tuple[int, ...]) -> None:
+    for name, shape in shapes.items():
+        if tensors[name].shape != shape or not np.isfinite(tensors[name]).all():
+            raise ValueError(f"{name} has shape {tensors[name].shape}, or values that are not finite")
 
 
 def _delete(paths: Iterable[Path]) -> None:

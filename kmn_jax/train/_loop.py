@@ -15,6 +15,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,6 +32,7 @@ from kmn_jax.models import model_structure, save_model
 from kmn_jax.report import check_target
 from kmn_jax.train._checkpoint import Checkpoints
 from kmn_jax.train._config import TrainConfig
+from kmn_jax.train._lock import only_one
 from kmn_jax.train._records import add_metrics, begin_metrics, check_same, write_config, write_session
 from kmn_jax.train._sharding import (
     any_process,
@@ -92,8 +94,8 @@ def train(
     default to stdout, above the progress bar.
 
     Raises:
-        InputError: a folder with a run and no `resume`, a config that differs from the run's, data that cannot be
-            used, or batches that devices cannot share.
+        InputError: a folder with a run and no `resume`, or in which another process trains, a config that differs
+            from the run's, data that cannot be used, batches that devices cannot share, or a full disk.
         NotFiniteError: a loss or gradient was not finite; state and batch are in the run's folder `nan`.
     """
     folder = Path(folder)
@@ -101,9 +103,11 @@ def train(
     # By one process, or the others might find what it has just written.
     from_first_process(lambda: _check_free(folder, resume))
     run = _Run(config, folder, data_mesh(), stop, report or _print)
-    run.restore()
-    with stop:
-        return run.loop(progress)
+    with ExitStack() as held:
+        from_first_process(lambda: held.enter_context(only_one(folder)))
+        run.restore()
+        with stop:
+            return run.loop(progress)
 
 
 def _check_free(folder: Path, resume: bool) -> None:

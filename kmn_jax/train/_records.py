@@ -55,8 +55,7 @@ def begin_metrics(folder: Path, step: int, validated: int) -> None:
 def add_metrics(folder: Path, row: Row) -> None:
     """Append a row of some of the COLUMNS, `step` and `split` always, to `metrics.jsonl` and `metrics.csv`."""
     for name, text in ((_LINES, json.dumps(dict(row)) + "\n"), (_TABLE, _csv([row]))):
-        with (folder / name).open("a", encoding="utf-8") as file:
-            file.write(text)
+        _append(folder / name, text)
 
 
 def read_metrics(folder: str | Path) -> list[dict[str, Any]]:
@@ -107,8 +106,15 @@ def write_session(folder: Path, step: int, facts: Mapping[str, Any]) -> None:
         "cores": os.cpu_count(),
         "processes": jax.process_count(),
     }
-    with (folder / "sessions.jsonl").open("a", encoding="utf-8") as file:
-        file.write(json.dumps(session) + "\n")
+    _append(folder / "sessions.jsonl", json.dumps(session) + "\n")
+
+
+def _append(path: Path, text: str) -> None:
+    try:
+        with path.open("a", encoding="utf-8") as file:
+            file.write(text)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}") from None
 
 
 def _version(name: str) -> str | None:

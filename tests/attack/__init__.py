@@ -1,0 +1,1 @@
+"""Attacks: damaged files of every format that is read, kills at any moment, and what must come of them."""

@@ -1,0 +1,190 @@
+"""Kill commands at random moments, start them again, and see that nothing is lost and the results are the same.
+
+python -m tests.attack.kills --kills 200 --seed 0 --json FILE [--only training]
+
+Each command first runs without a stop. Then it is killed (SIGKILL) a few times, at its start or while it writes, alone
+or with the processes that it has started; after each kill what it left is looked at, at last it ends and is compared.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import tyro
+from tqdm import tqdm
+
+from kmn_jax.errors import InputError
+from kmn_jax.report import commit, print_table, processor, write_json
+from tests.attack.activities import ACTIVITIES, Activity
+from tests.train.loop_sample import ENVIRONMENT, ONE_DEVICE
+
+_ROOT = Path(__file__).parents[2]
+_MOST_SECONDS = 900  # of a command
+_EARLY = 0.15  # share of kills before a command has written anything
+_MOST_IN_A_ROW = 4
+
+
+@dataclass
+class Tally:
+    """What came of the kills of one activity."""
+
+    activity: str
+    kills: int = 0
+    before_writing: int = 0
+    finished: int = 0  # runs that ended after kills, and were compared
+    too_late: int = 0  # had ended before the signal came
+    faults: list[str] = field(default_factory=list)
+    leftovers: int = 0  # hidden files that lie there when a run has finished
+    seconds: float = 0.0  # of the run without a stop
+
+
+def main(kills: int = 200, seed: int = 0, json: Path | None = None, only: str = "") -> int:
+    """Kill, and return 1 if anything was lost or differs.
+
+    Args:
+        kills: how many, shared by all activities.
+        seed: number that the moments follow from, as far as clocks allow.
+        json: where counts and faults go.
+        only: name of one activity; the others are left out.
+    """
+    chosen = {name: activity for name, activity in ACTIVITIES.items() if only in ("", name)}
+    if not chosen:
+        raise InputError(f"there is no activity {only!r}: there are {', '.join(ACTIVITIES)}")
+    start, tallies = time.perf_counter(), []
+    with tqdm(total=kills, unit="kill") as bar:
+        for row, (name, activity) in enumerate(chosen.items()):
+            share = kills // len(chosen) + (row < kills % len(chosen))
+            tallies.append(killed(name, activity, share, Random(f"{seed} {name}"), bar))
+    rows = [asdict(tally) | {"faults": len(tally.faults)} for tally in tallies]
+    print_table(f"{sum(tally.kills for tally in tallies)} kills, seed {seed}", rows)
+    for tally in tallies:
+        for fault in tally.faults:
+            print(f"{tally.activity}: {fault}")
+    seconds = round(time.perf_counter() - start)
+    machine = {"processor": processor(), "cores": os.cpu_count(), "commit": commit()}
+    write_json(json, {"activities": list(map(asdict, tallies)), "seed": seed, "seconds": seconds, **machine})
+    return int(any(tally.faults for tally in tallies))
+
+
+def killed(name: str, activity: Activity, kills: int, random: Random, bar: Any = None) -> Tally:
+    """Kill runs of an activity so many times, and let each of them end after a few kills."""
+    tally = Tally(name)
+    with tempfile.TemporaryDirectory(prefix="kills-") as place:
+        whole = Path(place, "whole")
+        whole.mkdir()
+        start = time.monotonic()
+        _finish(activity, whole)
+        tally.seconds = round(time.monotonic() - start, 1)
+        writes = _seconds_of_writing(activity, Path(place, "again"))
+        number = 0
+        while tally.kills < kills:
+            folder = Path(place, str(number))
+            folder.mkdir()
+            number += 1
+            for _ in range(min(random.randint(1, _MOST_IN_A_ROW), kills - tally.kills)):
+                _kill(activity, folder, writes, random, tally)
+                if bar is not None:
+                    bar.update()
+                _note(tally, f"run {number}, kill {tally.kills}", activity.intact, folder, whole)
+            try:
+                _finish(activity, folder)
+            except RuntimeError as error:
+                tally.faults.append(f"run {number}, after kill {tally.kills}: {error}")
+                continue
+            _note(tally, f"run {number}, at its end", activity.same, folder, whole)
+            tally.finished += 1
+            tally.leftovers += sum(path.name.startswith(".") for path in folder.rglob("*"))
+    return tally
+
+
+def _note(tally: Tally, when: str, check: Any, folder: Path, whole: Path) -> None:
+    try:
+        check(folder, whole)
+    except Exception as error:  # whatever a damaged file leads to
+        tally.faults.append(f"{when}: {type(error).__name__}: {str(error)[:300]}")
+
+
+def _start(command: Sequence[str], errors: Any = subprocess.DEVNULL) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        command,
+        cwd=_ROOT,
+        env=os.environ | ENVIRONMENT | {"XLA_FLAGS": ONE_DEVICE},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=errors,
+        start_new_session=True,
+    )
+
+
+def _finish(activity: Activity, folder: Path) -> None:
+    with tempfile.TemporaryFile() as errors:
+        process = _start(activity.command(folder), errors)
+        try:
+            code = process.wait(timeout=_MOST_SECONDS)
+        except subprocess.TimeoutExpired:
+            _end(process, True)
+            raise RuntimeError(f"it took longer than {_MOST_SECONDS} s") from None
+        if code != 0:
+            errors.seek(0)
+            raise RuntimeError(f"it ended with code {code}: {errors.read().decode('utf-8', 'replace')[-300:]}")
+
+
+def _seconds_of_writing(activity: Activity, folder: Path) -> float:
+    """Return how long a run takes from what it writes first to its end, with everything compiled."""
+    folder.mkdir()
+    process = _start(activity.command(folder))
+    while process.poll() is None and not activity.begun(folder):
+        time.sleep(0.005)
+    start = time.monotonic()
+    process.wait(timeout=_MOST_SECONDS)
+    return max(time.monotonic() - start, 0.05)
+
+
+def _kill(activity: Activity, folder: Path, writes: float, random: Random, tally: Tally) -> None:
+    early, alone, moment = random.random() < _EARLY, random.random() < 0.3, random.random()
+    going_on = activity.begun(folder)
+    process = _start(activity.command(folder))
+    start = time.monotonic()
+    if early or going_on:  # the start takes seconds, in which what is there is read
+        limit = (2 if early else 6 + writes) * moment
+    else:
+        while process.poll() is None and not activity.begun(folder):
+            time.sleep(0.002)
+        start, limit = time.monotonic(), writes * moment
+    while process.poll() is None and time.monotonic() - start < limit:
+        time.sleep(0.002)
+    tally.kills += 1
+    tally.too_late += process.poll() is not None
+    tally.before_writing += not activity.begun(folder)
+    _end(process, not alone)
+    assert process.returncode is not None
+
+
+def _end(process: subprocess.Popen[bytes], group: bool) -> None:
+    """Kill a process, and those that it has started; the latter also where they would notice by themselves."""
+    if not group:
+        process.kill()
+        process.wait()
+        time.sleep(0.2)  # those that it has started write on for a moment
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(tyro.cli(main))
+    except InputError as error:
+        print(f"kills: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -1,0 +1,88 @@
+"""The harness of kills finds what a kill loses, on commands of milliseconds."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from kmn_jax.errors import InputError
+from tests.attack.activities import ACTIVITIES
+from tests.attack.kills import killed, main
+
+# Writes ten lines with pauses: each whole in a file of its own, or into one file that a restart begins anew.
+WHOLE = """
+import os, sys, time
+for row in range(10):
+    path = os.path.join(sys.argv[1], f"{row}.txt")
+    if not os.path.exists(path):
+        with open(path + ".half", "w") as file:
+            file.write(f"line {row}")
+        os.rename(path + ".half", path)
+        time.sleep(0.02)
+"""
+TORN = """
+import os, sys, time
+with open(os.path.join(sys.argv[1], "all.txt"), "a") as file:
+    for row in range(10):
+        print(f"line {row}", file=file, flush=True)
+        time.sleep(0.02)
+"""
+
+
+class Writing:
+    """An activity that writes text files."""
+
+    def __init__(self, program: str) -> None:
+        self.program = program
+
+    def command(self, folder: Path) -> list[str]:
+        return [sys.executable, "-S", "-c", self.program, str(folder)]
+
+    def begun(self, folder: Path) -> bool:
+        return any(folder.iterdir())
+
+    def intact(self, folder: Path, whole: Path) -> None:
+        for path in folder.glob("*.txt"):
+            assert path.read_bytes() == (whole / path.name).read_bytes(), f"{path.name} is torn"
+
+    def same(self, folder: Path, whole: Path) -> None:
+        contents = [{path.name: path.read_bytes() for path in place.glob("*.txt")} for place in (folder, whole)]
+        assert contents[0] == contents[1], "the end differs"
+
+
+def test_what_is_written_whole_survives() -> None:
+    tally = killed("whole", Writing(WHOLE), 6, Random(0))
+    assert (tally.kills, tally.faults) == (6, [])
+    assert 0 < tally.finished <= 6
+    assert tally.too_late < 6
+
+
+def test_what_is_torn_is_found() -> None:
+    tally = killed("torn", Writing(TORN), 6, Random(0))
+    assert any("all.txt is torn" in fault for fault in tally.faults)
+    assert any("the end differs" in fault for fault in tally.faults)
+
+
+def test_a_command_that_cannot_go_on_is_a_fault() -> None:
+    program = "import os, sys\nos.mkdir(sys.argv[1] + '/a')\nimport time\ntime.sleep(0.3)"
+    tally = killed("stuck", Writing(program), 2, Random(1))
+    assert tally.finished == 0
+    assert any("it ended with code 1" in fault and "FileExistsError" in fault for fault in tally.faults)
+
+
+def test_activities_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert set(ACTIVITIES) >= {"training", "pack building", "prepare", "evaluation"}
+    with pytest.raises(InputError, match="there is no activity 'cooking'"):
+        main(only="cooking")
+
+
+@pytest.mark.parametrize("name", ACTIVITIES)
+def test_commands_are_in_the_folder(name: str, tmp_path: Path) -> None:
+    activity: object = ACTIVITIES[name]
+    command: Callable[[Path], list[str]] = activity.command  # type: ignore[attr-defined]
+    assert any(str(tmp_path) in word for word in command(tmp_path))
+    assert not ACTIVITIES[name].begun(tmp_path)
