@@ -34,6 +34,8 @@ _SHARES = ("explained", "violated", "occluded", "unknown")
 _CLOSE_GAP = 0.05  # of probabilities
 _CONSIDERED = 128  # most probable poses that are compared with each other: one number, so one compilation
 _MOST_UNEXPLAINED = 0.5  # of the foreground: with more, it is told how to narrow it down
+_FLUSH = 0.4  # of the outline: with more of it in the plane of a larger surface, a pose may be on a wall or a table
+_MANY_FLUSH = 3  # poses: fewer need not be told
 _SYMMETRIC = "the object is symmetric: of the poses that look the same, this is the canonical one"
 _NARROW = (
     ": on walls, rims and tables poses may be wrong though they are called probable; give the scan without parts"
@@ -112,8 +114,8 @@ def detect(
     result = Detections(part.name, scene.unit, poses, clock.timing, reason, warnings)
     if at is not None:
         return result
-    if share > _MOST_UNEXPLAINED and not scene.is_narrowed:
-        warnings = (*warnings, f"{share:.0%} of the foreground is on no pose that was found{_NARROW}")
+    if not scene.is_narrowed:
+        warnings = (*warnings, *narrowing(found.evidence[accepted], float(share)))
     return replace(result, warnings=warnings, unexplained=float(share), unexplained_points=points.astype(np.float32))
 
 
@@ -244,6 +246,16 @@ def _detection(row: int, probability: float, gap: float, found: Candidates, part
         warnings=tuple(text for text, holds in notes if holds),
         **shares,
     )
+
+
+def narrowing(evidence: Float[np.ndarray, "a f"], share: float) -> tuple[str, ...]:
+    """Return warnings that name how to say where parts are, given the evidence on accepted poses and what is left."""
+    flush = int((evidence[:, EVIDENCE.index("coplanar")] > _FLUSH).sum())
+    texts = (
+        (flush >= _MANY_FLUSH, f"{flush} poses lie flush in a larger surface"),
+        (share > _MOST_UNEXPLAINED, f"{share:.0%} of the foreground is on no pose that was found"),
+    )
+    return tuple(text + _NARROW for holds, text in texts if holds)
 
 
 def _reason(found: Candidates, part: Part) -> str:

@@ -23,6 +23,7 @@ from kmn_jax.detection import (
     seeds_over,
 )
 from kmn_jax.detection._coverage import SEARCHED, SEARCHED_FINELY, unexplained
+from kmn_jax.detection._detect import narrowing
 from kmn_jax.detection._seeds import SPACING
 from kmn_jax.errors import InputError
 from kmn_jax.pose import PoseResult
@@ -123,3 +124,14 @@ def test_what_lies_on_no_pose_is_unexplained(scene: Scene) -> None:
     assert both[on_wall & beside].all()
     np.testing.assert_array_equal(one[~on_wall], scene.points[~on_wall, 0] > 0)
     assert not unexplained(~everything, scene, part, np.stack(POSES)).any()
+
+
+def test_poses_that_pile_up_on_a_plane_bring_a_warning() -> None:
+    evidence = np.zeros((4, len(EVIDENCE)), dtype=np.float32)
+    assert narrowing(evidence, 0.1) == ()
+    evidence[:3, EVIDENCE.index("coplanar")] = 0.9
+    (flush,) = narrowing(evidence, 0.1)
+    assert flush.startswith("3 poses lie flush in a larger surface")
+    assert all(flag in flush for flag in ("--background", "--roi"))
+    (left,) = narrowing(evidence[3:], 0.7)
+    assert left.startswith("70% of the foreground is on no pose")
