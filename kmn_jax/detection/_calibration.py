@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from kmn_jax.errors import InputError
+from kmn_jax.limits import parse_json
 
 _RIDGE = 1e-3  # keeps weights finite where the evidence separates right from wrong completely
 
@@ -104,7 +105,7 @@ def probabilities_bytes(probabilities: Probabilities) -> bytes:
 def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
     """Read models of the evidence with the given names. Raises InputError if the file holds anything else."""
     try:
-        stored = json.loads(Path(path).read_text(encoding="utf-8"))
+        stored = parse_json(Path(path).read_text(encoding="utf-8"))
         models = [
             Calibration(
                 tuple(str(name) for name in found["names"]),
