@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
+from kmn_jax.bop._files import read_json
+from kmn_jax.data import Pack
+from kmn_jax.detection._calibration import load_probabilities
 from kmn_jax.errors import InputError
+from kmn_jax.io._scans import read_camera
 from kmn_jax.limits import SETTING, check_bytes, check_elements, most_bytes, most_elements, parse_json
+from kmn_jax.models import load_model
+from kmn_jax.objects import load_part
 
 PACKAGE = Path(__file__).parent.parent / "kmn_jax"
 
@@ -65,6 +74,41 @@ def test_json_is_weighed_before_it_is_read(monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(InputError, match=r"it takes .* bytes, more than 50000"):
         parse_json(text)
     assert len(parse_json("[" + "0.123456789, " * 300 + "1]")) == 301
+
+
+def card(path: Path, text: str) -> None:
+    load_part(safetensors(path, {"format": "kmn_jax object card 1", "facts": text}))
+
+
+def safetensors(path: Path, header: dict[str, str]) -> Path:
+    save_file({"a": np.zeros(1, np.float32)}, path, metadata=header)
+    return path
+
+
+def plain(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+READERS: dict[str, Callable[[Path, str], object]] = {
+    "camera": lambda path, text: read_camera(plain(path, text)),
+    "card": card,
+    "model": lambda path, text: load_model(safetensors(path, {"kmn_jax.config": text})),
+    "calibration": lambda path, text: load_probabilities(plain(path, text), ("a",)),
+    "pack": lambda path, text: Pack(plain(path / "manifest.json", text).parent),
+    "dataset": lambda path, text: read_json(plain(path, text)),
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_deep_json_is_one_sentence_of_every_reader(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    if name == "pack":
+        path.mkdir()
+    for depth in (100, 300_000):
+        with pytest.raises(InputError, match="nested deeper than 64 levels") as caught:
+            READERS[name](path, '{"a": ' + "[" * depth + "]" * depth + "}")
+        assert str(caught.value).startswith(str(path))
 
 
 def test_all_json_is_read_by_one_function() -> None:

@@ -151,12 +151,11 @@ def read_json_by_id(file: Path) -> dict[int, Any]:
     for key, value in content.items():
         if not (key.isascii() and key.isdigit()):
             raise BopFault(file, f"key {key[:40]!r}", "must be an id, a whole number")
-        number = int(key) if len(key) <= _MOST_DIGITS else -1
-        if number < 0:
+        if len(key) > _MOST_DIGITS:
             raise BopFault(file, f"key {key[:40]!r}...", f"has more than {_MOST_DIGITS} digits, but must be an id")
-        if number in entries:
+        if int(key) in entries:
             raise BopFault(file, f"key {key[:40]!r}", "stands there twice")
-        entries[number] = value
+        entries[int(key)] = value
     return dict(sorted(entries.items()))
 
 

@@ -83,10 +83,10 @@ def _elements(primitive: dict[str, Any], counts: list[int]) -> int:
 
 
 def _visits(tree: dict[str, Any], nodes: list[dict[str, Any]]) -> tuple[list[int], int]:
-    """Return how often each node is named as a root or a child, as the reader follows each of these ways once.
+    """Return how often each node is named as a root or a child, for the reader follows each of these ways once.
 
-    And how many pieces it could read in the time that it takes for their being deep. Raises ValueError if they are
-    deeper than anybody nests them, or name themselves.
+    And how many pieces it reads in the time that their depth takes it. Raises InputError for nodes that are deeper than
+    anybody nests them, or within themselves.
     """
     visits, deep = [0] * len(nodes), 0
     scenes = tree.get("scenes", ())
@@ -94,7 +94,7 @@ def _visits(tree: dict[str, Any], nodes: list[dict[str, Any]]) -> tuple[list[int
     for named in (roots, *(node.get("children", ()) for node in nodes)):
         for index in named:
             visits[index] += 1
-    level = set(roots)
+    level = set(roots) if sum(visits) <= _MOST_PIECES else set()  # else they are too many anyway
     for depth in range(_DEEPEST):
         deep += len(level) * depth**3 // _CUBE
         level = {child for index in level for child in nodes[index].get("children", ())}

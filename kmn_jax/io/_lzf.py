@@ -25,7 +25,7 @@ def unpack_lzf(packed: bytes, size: int) -> bytes:
             if stop <= length:
                 result += result[start:stop]
             else:  # it overlaps what it yields
-                result += (result[start:] * count)[:count]
+                result += (result[start:] * (count // (length - start) + 1))[:count]
             position += 2
             length += count
         if length > size:

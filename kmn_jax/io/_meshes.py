@@ -14,7 +14,7 @@ from kmn_jax.io._glb import parse_glb
 from kmn_jax.io._ply import parse_ply
 from kmn_jax.io._step import step_to_glb
 from kmn_jax.io._stl_obj import parse_obj, parse_stl
-from kmn_jax.limits import check_bytes
+from kmn_jax.limits import check_bytes, most_bytes
 from kmn_jax.units import check_unit
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb", ".step", ".stp")
@@ -68,16 +68,19 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
 def read_file(path: Path, what: str = "a CAD file") -> bytes:
     """Return the content of a file, or raise InputError if it is missing, not a file, empty, or beyond the budget."""
     try:
-        if path.exists() and not path.is_file():
-            raise InputError(f"{path} is {'a folder' if path.is_dir() else 'not a regular file'}: name {what}")
-        check_bytes(path.stat().st_size)
-        content = path.read_bytes()
-    except InputError as error:
-        raise error if str(path) in str(error) else InputError(f"{path} cannot be used: {error}") from None
+        regular = path.is_file() or not path.exists()
+        size = path.stat().st_size
+        content = path.read_bytes() if regular and size <= most_bytes() else b""
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
     except ValueError as error:  # a null character
         raise InputError(f"{str(path)!r} cannot be read: {error}") from None
+    if not regular:
+        raise InputError(f"{path} is {'a folder' if path.is_dir() else 'not a regular file'}: name {what}")
+    try:
+        check_bytes(size)
+    except InputError as error:
+        raise InputError(f"{path} cannot be used: {error}") from None
     if not content:
         raise InputError(f"{path} is empty (0 bytes): name {what}")
     return content

@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int64
 
 from kmn_jax.errors import InputError
 from kmn_jax.io._text import pieces
-from kmn_jax.limits import check_elements
+from kmn_jax.limits import check_elements, most_elements
 
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER = 84
@@ -65,7 +65,7 @@ def parse_obj(content: bytes) -> tuple[Float64[np.ndarray, "v 3"], Int64[np.ndar
 
     Raises InputError, without the file's name, that names the first line which cannot be understood.
     """
-    coordinates, triangles = array("d"), array("q")
+    coordinates, triangles, most = array("d"), array("q"), 3 * most_elements()
     for number, line in enumerate(_lines(content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")), start=1):
         if len(line) > _LONGEST_LINE:
             raise InputError(f"line {number} is longer than {_LONGEST_LINE} bytes: it is damaged, or no OBJ file")
@@ -83,6 +83,10 @@ def parse_obj(content: bytes) -> tuple[Float64[np.ndarray, "v 3"], Int64[np.ndar
                 first, *rest = (i - 1 if i > 0 else len(coordinates) // 3 + i for i in corners)
                 for second, third in pairwise(rest):
                     triangles.extend((first, second, third))
+                if len(triangles) > most:
+                    check_elements(len(triangles) // 3, "triangles")
+        except InputError:
+            raise
         except (ValueError, OverflowError):
             shown = line.strip()[:60].decode("latin-1")
             raise InputError(f"line {number} is not a {'vertex' if kind == b'v' else 'face'}: {shown!r}") from None

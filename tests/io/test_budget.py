@@ -28,7 +28,7 @@ CAMERA = json.dumps({"fx": 80.0, "fy": 82.0, "cx": 7.5, "cy": 5.5})
 
 
 def refused(path: Path, message: str) -> None:
-    read = read_mesh if path.suffix in (".glb", ".step") else lambda name: read_scan(name, "mm", camera)
+    read = read_mesh if path.suffix in (".glb", ".step", ".obj") else lambda name: read_scan(name, "mm", camera)
     camera = written(path.parent, "camera.json", CAMERA)
     tracemalloc.start()
     try:
@@ -200,6 +200,17 @@ def test_images_of_datasets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         bop_scan(image)
 
 
+def test_masks_of_many_instances(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = write_sample(tmp_path, num_frames=1) / "test" / "000000"
+    truth = json.loads((scene / "scene_gt.json").read_text())
+    truth["0"] *= 67
+    (scene / "scene_gt.json").write_text(json.dumps(truth))
+    (scene / "scene_gt_info.json").unlink()
+    monkeypatch.setenv(SETTING, "500000")
+    with pytest.raises(InputError, match=r"names 201 instances, and of their masks: it takes 617472 bytes"):
+        BopDataset(tmp_path, "test").frame(0, 0, masks=True)
+
+
 def test_exr_of_many_channels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import OpenEXR
 
@@ -244,6 +255,14 @@ def test_ply_polygons_of_many_corners(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(SETTING, "100000000")
         refused(written(tmp_path, "a.ply", content), "it takes .* bytes, more than 100000000")
+
+
+def test_obj_polygons_of_many_corners(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(SETTING, "1000000")
+    for corners, message in ((40_000, "it has 39998 triangles, more than 25000"), (600_000, "line 4 is longer than")):
+        text = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf" + b" 1" * corners
+        refused(written(tmp_path, "a.obj", text), message)
+        monkeypatch.delenv(SETTING, raising=False)
 
 
 def test_pcd_that_unpacks_to_more_than_it_says(tmp_path: Path) -> None:
