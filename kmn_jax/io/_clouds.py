@@ -85,16 +85,16 @@ def _columns(header: dict[str, list[str]], body: bytes) -> dict[str, np.ndarray]
         body, kinds = parse_numbers(body).tobytes(), ["<f8"] * len(kinds)
     fields = list(zip(names, kinds, counts, strict=True))
     size = total * sum(np.dtype(kind).itemsize * count for _, kind, count in fields)
-    check_elements(total)
-    check_bytes(size)
     by_column = layout == "binary_compressed"
     if by_column:
         packed, unpacked = (int.from_bytes(body[start : start + 4], "little") for start in (0, 4))
         if len(body) - 8 < packed or unpacked != size:
             raise ValueError(f"{len(body)} bytes of data do not hold {total} points")
+        check_bytes(size)
         body = unpack_lzf(body[8 : 8 + packed], size)
     if total < 0 or len(body) != size:
         raise ValueError(f"{total} points take {size} bytes, but there are {len(body)}")
+    check_elements(total)
     # Stored point after point, or all values of the first field, then of the next.
     shapes = [(total, count) if by_column else (count,) for count in counts]
     record = np.dtype([(str(i), kind, shapes[i]) for i, (_, kind, _) in enumerate(fields)])

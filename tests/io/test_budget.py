@@ -86,7 +86,7 @@ GLB = {
     "made up values": (glb([{"mesh": 0}], [0], accessors=[MADE_UP] * 2000), "takes .* bytes, more than 2000000000"),
     "one view many times": (glb([{"mesh": 0}], [0], 3000, bufferViews=views(60_000)), "bytes, more than 2000000000"),
     "many pieces of a mesh": (
-        glb([{"mesh": 0}], [0], meshes=[{"primitives": [{"attributes": {"POSITION": 0}}] * 10_500}]),
+        glb([{"mesh": 0}] * 3, [0, 1, 2], meshes=[{"primitives": [{"attributes": {"POSITION": 0}}] * 5100}]),
         "are too many or too deep",
     ),
     "fewer than none": (
@@ -270,9 +270,10 @@ def test_pcd_that_unpacks_to_more_than_it_says(tmp_path: Path) -> None:
         "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA binary_compressed\n"
     )
     packed = b"\x00\x01" + b"\xe0\xff\x00" * 1_000_000  # a byte, then 264 like the one before again and again
-    for points, size, message in (
+    cases = (
         (100, 1200, "not the LZF of 1200 bytes"),
-        (60_000_000, 720_000_000, "60000000 points"),
-    ):
+        (200_000_000, 2_400_000_000, "takes 2400000000 bytes"),
+    )
+    for points, size, message in cases:
         content = header.format(points).encode() + struct.pack("<II", len(packed), size) + packed
         refused(written(tmp_path, "a.pcd", content), message)
