@@ -179,11 +179,31 @@ def test_images_of_many_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         refused(tmp_path / f"a.{kind.lower()}", "it has 10100 pixels, more than 10000")
 
 
-def test_tiff_of_tiles_larger_than_the_image(tmp_path: Path) -> None:
-    tags = {256: 16, 257: 12, 258: 16, 259: 1, 262: 1, 277: 1, 322: 40_000, 323: 40_000, 324: 8, 325: 384}
+def tiff(tags: dict[int, int]) -> bytes:
     entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
     directory = struct.pack("<H", len(tags)) + entries + bytes(4)
-    content = b"II*\0" + struct.pack("<I", 8 + 384) + bytes(384) + directory
+    return b"II*\0" + struct.pack("<I", 8 + 384) + bytes(384) + directory
+
+
+def test_libraries_keep_quiet(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = write_sample(tmp_path, num_frames=1) / "test" / "000000"
+    Image.fromarray(np.arange(192, dtype=np.uint16).reshape(12, 16)).save(tmp_path / "a.tif", compression="tiff_lzw")
+    content = bytearray((tmp_path / "a.tif").read_bytes())
+    content[12:200] = b"\xff" * 188
+    many_samples = tiff({256: 16, 257: 12, 258: 16, 259: 1, 262: 1, 273: 8, 277: 100, 278: 12, 279: 384})
+    (scene / "depth" / "000000.png").unlink()
+    for damaged in (bytes(content), many_samples):
+        refused(written(tmp_path, "a.tif", damaged), "it is not a readable image")
+        with pytest.raises(InputError, match="is not a readable image"):
+            bop_scan(written(scene / "depth", "000000.tif", damaged))
+    assert tuple(capfd.readouterr()) == ("", "")
+    assert caplog.records == []
+
+
+def test_tiff_of_tiles_larger_than_the_image(tmp_path: Path) -> None:
+    content = tiff({256: 16, 257: 12, 258: 16, 259: 1, 262: 1, 277: 1, 322: 40_000, 323: 40_000, 324: 8, 325: 384})
     refused(written(tmp_path, "a.tif", content), "it has 1600000000 pixels in a tile")
 
 
