@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import secrets
 import stat
+import sys
+import time
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from kmn_jax.errors import InputError
 
+if sys.platform != "win32":
+    import fcntl
+
+_SECONDS_TO_LOCK = 2.0  # that a process may take from making a file to locking it
+
 
 def write_whole(path: str | Path, content: bytes) -> None:
     """Write `content` beside `path` and move it there in one step.
 
-    An existing file is replaced and its mode kept, a link followed; devices and pipes are written to.
+    An existing file is replaced and its mode kept, a link followed; devices and pipes are written to. What a process
+    that was killed left of an earlier attempt, `.NAME.` and 16 digits, is removed, on systems that can tell.
 
     Raises:
         InputError: the folder does not exist or cannot be written to.
@@ -27,17 +38,42 @@ def write_whole(path: str | Path, content: bytes) -> None:
         if mode is not None and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
             target.write_bytes(content)
             return
+        _remove_left_over(target)
         temporary = target.with_name(f".{target.name[:100]}.{secrets.token_hex(8)}")
         try:
-            temporary.touch(exist_ok=False)  # under the user's umask
-            if mode is not None:
-                temporary.chmod(stat.S_IMODE(mode))
-            temporary.write_bytes(content)
-            temporary.replace(target)
+            with temporary.open("xb") as file:  # under the user's umask
+                _lock(file)
+                if mode is not None:
+                    temporary.chmod(stat.S_IMODE(mode))
+                file.write(content)
+                file.flush() if sys.platform != "win32" else file.close()  # which moves no open file
+                temporary.replace(target)
         finally:
             temporary.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}") from None
+
+
+def _remove_left_over(target: Path) -> None:
+    """Remove temporary files of a target that no process holds locked, or made just now and is about to lock."""
+    name = re.compile(rf"\.{re.escape(target.name[:100])}\.[0-9a-f]{{16}}")
+    with contextlib.suppress(OSError):  # another process may be as quick, and not every folder can be listed
+        for path in filter(lambda path: name.fullmatch(path.name), target.parent.iterdir()):
+            if time.time() - path.stat().st_mtime > _SECONDS_TO_LOCK:
+                with path.open("rb") as file:
+                    if _lock(file):
+                        path.unlink()
+
+
+def _lock(file: BinaryIO) -> bool:
+    """Lock a file until it is closed or its process ends, and tell whether it worked."""
+    if sys.platform == "win32":
+        return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
 
 
 def check_output(path: Path, *read: Path | None) -> None:

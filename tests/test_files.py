@@ -1,8 +1,12 @@
 from __future__ import annotations
 
+import fcntl
 import os
 import stat
+import subprocess
+import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -55,6 +59,43 @@ def test_devices_and_pipes_are_written_to(tmp_path: Path) -> None:
     reader.join(timeout=20)
     assert got == [b"through"]
     assert [p.name for p in tmp_path.iterdir()] == ["pipe"]
+
+
+def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
+    program = (
+        "import os, pathlib, signal, sys; from kmn_jax.files import write_whole\n"
+        "pathlib.Path.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "write_whole(sys.argv[1], b'half')\n"
+    )
+    subprocess.run([sys.executable, "-c", program, tmp_path / "a.bin"], check=False)
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".a.bin.")
+    other = tmp_path / f".a.bin.txt.{'0' * 16}"
+    other.write_bytes(b"of another target")
+    write_whole(tmp_path / "a.bin", b"too soon to tell")
+    assert left.exists()
+    for path in (left, other):
+        os.utime(path, (time.time() - 60,) * 2)
+    with left.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_SH)
+        write_whole(tmp_path / "a.bin", b"another process is at it")
+        assert left.exists()
+    write_whole(tmp_path / "a.bin", b"whole")
+    assert {path.name for path in tmp_path.iterdir()} == {"a.bin", other.name}
+    assert (tmp_path / "a.bin").read_bytes() == b"whole"
+
+
+def test_a_file_is_locked_until_it_is_in_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = list[bool]()
+
+    def replace(self: Path, target: Path) -> None:
+        with self.open("rb") as file, pytest.raises(BlockingIOError):
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        seen.append(self.read_bytes() == b"whole")
+
+    monkeypatch.setattr(Path, "replace", replace)
+    write_whole(tmp_path / "a.bin", b"whole")
+    assert seen == [True]
 
 
 def test_what_cannot_be_written_is_told_before(tmp_path: Path) -> None:

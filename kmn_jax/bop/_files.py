@@ -14,10 +14,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Shaped, UInt16
 
 from kmn_jax.errors import InputError
+from kmn_jax.io import ImageHeader, image_header, read_image
+from kmn_jax.limits import check_bytes, parse_json
 from kmn_jax.units import METRES, check_unit
 
 SATURATED = 65535  # a 16-bit depth that did not fit, such as the background of BlenderProc: not a measurement
 _T = TypeVar("_T")
+_MOST_DIGITS = 18  # of an id
 _DEPTH_MODES = ("I;16", "I;16L", "I;16B", "I", "F")
 
 
@@ -134,8 +137,8 @@ def read_json(file: Path) -> Any:
     """Return what a JSON file holds, NaN included, which `Entry` refuses by name; two values of one key are refused."""
     content = _content(file)
     try:
-        return json.loads(content, object_pairs_hook=_object)
-    except (ValueError, RecursionError) as error:
+        return parse_json(content, _object)
+    except ValueError as error:
         raise BopFault(file, "", f"is not valid JSON ({error}): write it again") from None
 
 
@@ -148,6 +151,8 @@ def read_json_by_id(file: Path) -> dict[int, Any]:
     for key, value in content.items():
         if not (key.isascii() and key.isdigit()):
             raise BopFault(file, f"key {key[:40]!r}", "must be an id, a whole number")
+        if len(key) > _MOST_DIGITS:
+            raise BopFault(file, f"key {key[:40]!r}...", f"has more than {_MOST_DIGITS} digits, but must be an id")
         if int(key) in entries:
             raise BopFault(file, f"key {key[:40]!r}", "stands there twice")
         entries[int(key)] = value
@@ -174,12 +179,14 @@ def files_by_id(folder: Path, suffixes: tuple[str, ...], prefix: str = "") -> di
 
 def image_size(file: Path) -> tuple[int, int]:
     """Return the width and height that an image file announces, without decoding it."""
-    return _open_image(file, decode=False)[2]
+    checked_file(file)
+    header = _image_or_fault(image_header, file, file)
+    return header.width, header.height
 
 
 def read_depth(file: Path, factor: float) -> Float32[np.ndarray, "h w"]:
     """Return a depth image times `factor`, with 0 where nothing was measured: 0, saturated, negative or not finite."""
-    mode, kind, _, values = _open_image(file, decode=True)
+    (mode, kind, *_), values = _read_image(file)
     if mode not in _DEPTH_MODES or values.ndim != 2:
         raise BopFault(file, "", f"has {mode} pixels, but a depth image has one channel of 16 or 32 bits")
     depth = values.astype(np.float64)
@@ -191,7 +198,7 @@ def read_depth(file: Path, factor: float) -> Float32[np.ndarray, "h w"]:
 
 def read_mask(file: Path) -> Bool[np.ndarray, "h w"]:
     """Return where a mask image is not black."""
-    mode, _, _, values = _open_image(file, decode=True)
+    (mode, *_), values = _read_image(file)
     if values.ndim != 2:
         raise BopFault(file, "", f"has {mode} pixels, but a mask has one channel")
     return values != 0
@@ -210,24 +217,28 @@ def png_bytes(values: UInt16[np.ndarray, "h w"] | Bool[np.ndarray, "h w"]) -> by
 
 def pixels(file: Path) -> Shaped[np.ndarray, "..."]:
     """Return the stored values of an image file of any kind."""
-    return _open_image(file, decode=True)[3]
+    return _read_image(file)[1]
 
 
-def _open_image(file: Path, decode: bool) -> tuple[str, str | None, tuple[int, int], np.ndarray]:
-    from PIL import Image
+def _read_image(file: Path) -> tuple[ImageHeader, Shaped[np.ndarray, "..."]]:
+    return _image_or_fault(read_image, _content(file), file)
 
-    content: Path | io.BytesIO = io.BytesIO(_content(file)) if decode else checked_file(file)
+
+def _image_or_fault(read: Callable[..., _T], source: Path | bytes, file: Path) -> _T:
     try:
-        with Image.open(content) as image:
-            values = np.asarray(image) if decode else np.zeros((0, 0))
-            return image.mode, image.format, image.size, values
-    except Exception as error:  # each decoder has errors of its own
-        raise BopFault(file, "", f"is not a readable image ({type(error).__name__}: {error}): write it again") from None
+        return read(source)
+    except InputError as error:
+        raise BopFault(file, "", f"{str(error).removeprefix('it ')}: write it again") from None
 
 
 def _content(file: Path) -> bytes:
     try:
-        return checked_file(file).read_bytes()
+        check_bytes(checked_file(file).stat().st_size)
+        return file.read_bytes()
+    except BopFault:
+        raise
+    except InputError as error:
+        raise BopFault(file, "", str(error).removeprefix("it ")) from None
     except OSError as error:
         raise BopFault(file, "", f"cannot be read: {error.strerror}") from None
 

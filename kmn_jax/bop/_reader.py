@@ -23,7 +23,9 @@ from kmn_jax.bop._files import (
 )
 from kmn_jax.bop._frames import BopFrame, BopInstance, CameraEntry, parse_bin, parse_camera, parse_instance
 from kmn_jax.bop._writer import BIN_FILE
+from kmn_jax.errors import InputError
 from kmn_jax.geometry import Camera
+from kmn_jax.limits import check_bytes
 from kmn_jax.simulate import Bin
 
 _P = ParamSpec("_P")
@@ -179,6 +181,11 @@ class FrameReader:
 
     def _masks(self, name: str, size: tuple[int, int]) -> Bool[np.ndarray, "n h w"]:
         files = self._mask_files(name)
+        try:
+            check_bytes(len(files) * size[0] * size[1])
+        except InputError as error:
+            self.faults.append(self._fault(_TRUTH, f"names {len(files)} instances, and of their masks: {error}"))
+            files = []
         masks = np.zeros((len(files), size[1], size[0]), dtype=bool)
         for index, file in enumerate(files):
             mask = self._attempt(read_mask, file)

@@ -22,6 +22,7 @@ from typing import Any
 from kmn_jax.data._pack import VERSION, Entry, read_entry, write_manifest, write_object
 from kmn_jax.data._recipe import PackConfig, pack_object
 from kmn_jax.errors import InputError
+from kmn_jax.limits import parse_json
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,7 @@ class _Journal:
 
     def _parsed(self, line: bytes) -> dict[str, Any]:
         try:
-            return dict(json.loads(line))
+            return dict(parse_json(line))
         except (ValueError, TypeError) as error:
             raise InputError(f"{self.path} is damaged ({error}): delete {self.path.parent} and build again") from None
 

@@ -20,6 +20,7 @@ from safetensors.numpy import save
 from kmn_jax.errors import InputError
 from kmn_jax.files import read_safetensors, write_whole
 from kmn_jax.geometry import Camera
+from kmn_jax.limits import parse_json
 from kmn_jax.simulate import Bin, BinScene
 
 FORMAT, VERSION = "kmn_jax pack", 1
@@ -102,7 +103,13 @@ class Pack:
         if name not in self.entries:
             raise InputError(f"{self.folder} has no object {name!r}: its manifest lists {len(self.entries)} others")
         entry = self.entries[name]
-        result = _decode(*read_safetensors(self._checked(entry.objects)), self.folder / entry.objects.path)
+        path = self.folder / entry.objects.path
+        result = _decode(*read_safetensors(self._checked(entry.objects)), path)
+        if result.name != name:
+            raise InputError(
+                f"{path} holds the object {result.name!r}, but the manifest calls it {name!r}: build or copy the pack"
+                " again"
+            )
         if not visibility or entry.visibility is None:
             return result
         tensors, _ = read_safetensors(self._checked(entry.visibility))
@@ -172,7 +179,7 @@ def write_manifest(folder: str | Path, entries: list[Entry], **facts: Any) -> No
 
 def _read_manifest(path: Path) -> dict[str, Any]:
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
+        manifest = parse_json(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}): name the folder of a pack") from None
     except ValueError as error:
@@ -256,7 +263,7 @@ def _decode(tensors: dict[str, np.ndarray], metadata: dict[str, str], path: Path
     from scipy.spatial.transform import Rotation
 
     try:
-        facts = json.loads(metadata[_METADATA])
+        facts = parse_json(metadata[_METADATA])
         middle = np.array(facts["middle"])
         rotations = Rotation.from_quat(tensors["rotations"] / _LEVELS, scalar_first=True).as_matrix()
         centers = tensors["positions"] * (facts["reach"] / _LEVELS)

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Int32, Int64, UInt32, UInt64
 
 from kmn_jax.errors import InputError
+from kmn_jax.limits import parse_json
 
 _T = TypeVar("_T")
 _ROUNDS, _SHUFFLED, _ORDERED = range(3)  # independent streams of random numbers
@@ -226,7 +227,7 @@ class BatchIterator(Generic[_T]):
     def set_state(self, state: bytes) -> None:
         """Go on where the state was saved. Raises InputError if it is broken or of another order of samples."""
         try:
-            values = json.loads(state)
+            values = parse_json(state)
             if values["format"] != _STATE:
                 raise ValueError(f"format {values['format']!r}")
             number, facts, inner = int(values["next_batch"]), dict(values["facts"]), dict(values["grain"])

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from kmn_jax.errors import InputError
+from kmn_jax.limits import parse_json
 
 _RIDGE = 3e-3  # on standardised weights: keeps them finite where the evidence separates right from wrong completely
 _HIDDEN = 8
@@ -179,7 +180,7 @@ def probabilities_bytes(probabilities: Probabilities) -> bytes:
 def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
     """Read models of the evidence with the given names. Raises InputError if the file holds anything else."""
     try:
-        stored = json.loads(Path(path).read_text(encoding="utf-8"))
+        stored = parse_json(Path(path).read_text(encoding="utf-8"))
         models = [_read(found) for found in (stored["found"], stored["refined"])]
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is not a readable calibration: {error}") from None

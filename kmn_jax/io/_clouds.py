@@ -9,6 +9,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from kmn_jax.errors import InputError
+from kmn_jax.io._lzf import unpack_lzf
+from kmn_jax.io._text import parse_numbers
+from kmn_jax.limits import check_bytes, check_elements
 
 Cloud = tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"] | None]  # points, normals
 _KINDS = {"F": "f", "I": "i", "U": "u"}
@@ -20,6 +23,7 @@ def parse_xyz(content: bytes, with_normals: bool) -> Cloud:
     Further columns are not used. Raises InputError, without the file's name, that names the first bad line.
     """
     columns = 6 if with_normals else 3
+    check_elements(max(content.count(b"\n"), content.count(b"\r")), "lines")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of no data
@@ -41,6 +45,8 @@ def parse_pcd(content: bytes) -> Cloud:
     header, body = _header(content)
     try:
         named = _columns(header, body)
+    except InputError:
+        raise
     except (ValueError, TypeError, KeyError, IndexError, OverflowError) as error:
         raise InputError(f"it is truncated or damaged, or not a PCD file ({type(error).__name__}: {error})") from None
     if not {"x", "y", "z"} <= named.keys():
@@ -76,8 +82,7 @@ def _columns(header: dict[str, list[str]], body: bytes) -> dict[str, np.ndarray]
     if layout not in ("ascii", "binary", "binary_compressed"):
         raise ValueError(f"DATA {layout}")
     if layout == "ascii":
-        words = body.split()
-        body, kinds = np.fromiter(map(float, words), "<f8", len(words)).tobytes(), ["<f8"] * len(kinds)
+        body, kinds = parse_numbers(body).tobytes(), ["<f8"] * len(kinds)
     fields = list(zip(names, kinds, counts, strict=True))
     size = total * sum(np.dtype(kind).itemsize * count for _, kind, count in fields)
     by_column = layout == "binary_compressed"
@@ -85,33 +90,13 @@ def _columns(header: dict[str, list[str]], body: bytes) -> dict[str, np.ndarray]
         packed, unpacked = (int.from_bytes(body[start : start + 4], "little") for start in (0, 4))
         if len(body) - 8 < packed or unpacked != size:
             raise ValueError(f"{len(body)} bytes of data do not hold {total} points")
-        body = _unpack_lzf(body[8 : 8 + packed])
+        check_bytes(size)
+        body = unpack_lzf(body[8 : 8 + packed], size)
     if total < 0 or len(body) != size:
         raise ValueError(f"{total} points take {size} bytes, but there are {len(body)}")
+    check_elements(total)
     # Stored point after point, or all values of the first field, then of the next.
     shapes = [(total, count) if by_column else (count,) for count in counts]
     record = np.dtype([(str(i), kind, shapes[i]) for i, (_, kind, _) in enumerate(fields)])
     table = np.frombuffer(body, record)
     return {name: table[str(i)].reshape(total) for i, (name, _, count) in enumerate(fields) if count == 1}
-
-
-def _unpack_lzf(packed: bytes) -> bytes:
-    result, position = bytearray(), 0
-    while position < len(packed):
-        control = packed[position]
-        position += 1
-        if control < 32:  # so many bytes plus one as they are
-            result += packed[position : position + control + 1]
-            position += control + 1
-            continue
-        length = control >> 5  # of a piece that came before
-        if length == 7:
-            length += packed[position]
-            position += 1
-        start = len(result) - ((control & 31) << 8) - packed[position] - 1
-        position += 1
-        if start < 0:
-            raise ValueError("the data are not LZF")
-        piece = result[start : start + length + 2]
-        result += (piece * (length + 2))[: length + 2]  # it may overlap what it yields
-    return bytes(result)

@@ -8,19 +8,24 @@ import numpy as np
 
 from kmn_jax.errors import InputError
 from kmn_jax.io._apart import decoded_apart
+from kmn_jax.limits import most_bytes
 
 _DEPTH_NAMES = ("z", "depth")  # of a channel among others
 _PROGRAM = """
 import sys
 import numpy as np
 import OpenEXR
-source, target, most = sys.argv[1:]
+source, target, most, most_bytes = sys.argv[1:]
+taken = 0  # by what is decoded, and by what is made of it
 with OpenEXR.File(source, header_only=True) as file:
     announced = len(file.parts)
     for part in file.parts:
         low, high = (np.asarray(corner, dtype=float) for corner in part.header["dataWindow"])
         if np.prod(high - low + 1) > int(most):
             sys.exit(f"it announces more than {most} pixels")
+        taken += 8 * np.prod(high - low + 1) * len(part.header["channels"])
+        if taken > int(most_bytes):
+            sys.exit(f"its channels take more than {most_bytes} bytes")
 found, windows = [], []
 with OpenEXR.File(source, separate_channels=True) as file:
     if not 0 < announced == len(file.parts):
@@ -43,7 +48,7 @@ def parse_exr(content: bytes, most: int) -> np.ndarray:
     """
     if content[:4] != b"\x76\x2f\x31\x01":
         raise InputError("it is not an EXR file")
-    with np.load(io.BytesIO(decoded_apart(content, _PROGRAM, "OpenEXR", str(most)))) as file:
+    with np.load(io.BytesIO(decoded_apart(content, _PROGRAM, "OpenEXR", str(most), str(most_bytes())))) as file:
         found = dict(file)
     names = [str(name) for name in found["names"]]
     chosen = [i for i, name in enumerate(names) if name.rpartition(".")[2].lower() in _DEPTH_NAMES]

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import json
-import logging
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,9 +10,11 @@ from jaxtyping import Float, Float64, Int, Int32, Int64
 
 from kmn_jax.errors import InputError
 from kmn_jax.io._clouds import parse_pcd, parse_xyz
+from kmn_jax.io._glb import parse_glb
 from kmn_jax.io._ply import parse_ply
 from kmn_jax.io._step import step_to_glb
 from kmn_jax.io._stl_obj import parse_obj, parse_stl
+from kmn_jax.limits import check_bytes, most_bytes
 from kmn_jax.units import check_unit
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb", ".step", ".stp")
@@ -68,15 +66,21 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
 
 
 def read_file(path: Path, what: str = "a CAD file") -> bytes:
-    """Return the content of a file, or raise InputError if it is missing, not a file, or empty."""
+    """Return the content of a file, or raise InputError if it is missing, not a file, empty, or beyond the budget."""
     try:
-        if path.exists() and not path.is_file():
-            raise InputError(f"{path} is {'a folder' if path.is_dir() else 'not a regular file'}: name {what}")
-        content = path.read_bytes()
+        regular = path.is_file() or not path.exists()
+        size = path.stat().st_size
+        content = path.read_bytes() if regular and size <= most_bytes() else b""
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
     except ValueError as error:  # a null character
         raise InputError(f"{str(path)!r} cannot be read: {error}") from None
+    if not regular:
+        raise InputError(f"{path} is {'a folder' if path.is_dir() else 'not a regular file'}: name {what}")
+    try:
+        check_bytes(size)
+    except InputError as error:
+        raise InputError(f"{path} cannot be used: {error}") from None
     if not content:
         raise InputError(f"{path} is empty (0 bytes): name {what}")
     return content
@@ -101,44 +105,8 @@ def parse_mesh(content: bytes, suffix: str) -> Parsed:
             return *parse_pcd(content), none
         case ".xyz" | ".xyzn":
             return *parse_xyz(content, with_normals=suffix == ".xyzn"), none
-        case ".glb":
-            return _parse_glb(content)
-    return _parse_glb(step_to_glb(content))
-
-
-def _parse_glb(content: bytes) -> Parsed:
-    if content[:4] != b"glTF" or int.from_bytes(content[8:12], "little") != len(content):
-        raise InputError("it is truncated, or not a GLB file")
-    _check_counts(content)
-    import trimesh
-
-    log = logging.getLogger("trimesh")
-    before, log.disabled = log.disabled, True  # what matters is reported as an error
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            scene = trimesh.load_scene(io.BytesIO(content), file_type="glb", process=False, skip_materials=True)
-            mesh = scene.to_mesh()
-            vertices, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    except Exception as error:  # the reader has no error of its own, but all that Python has
-        reason = str(error).strip().partition("\n")[0][:120]
-        raise InputError(f"it is damaged ({type(error).__name__}: {reason})") from None
-    finally:
-        log.disabled = before
-    if vertices.shape[1:] != (3,) or triangles.shape[1:] != (3,):
-        raise InputError("it is damaged: its positions or triangles are not three numbers each")
+    vertices, triangles = parse_glb(content if suffix == ".glb" else step_to_glb(content))
     return vertices, None, triangles
-
-
-def _check_counts(content: bytes) -> None:
-    """Refuse a GLB file that announces more of anything than it has bytes: the reader would make it up of zeros."""
-    try:
-        tree = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
-        most = max((int(accessor["count"]) for accessor in tree.get("accessors", ())), default=0)
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
-        raise InputError(f"it is damaged: its header cannot be read ({type(error).__name__})") from None
-    if most > len(content):
-        raise InputError(f"it is damaged: it announces {most} values, but has {len(content)} bytes")
 
 
 def check_triangles(vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]) -> None:

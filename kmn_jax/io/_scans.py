@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import math
 import warnings
 import zipfile
@@ -16,13 +15,15 @@ from jaxtyping import Bool, Float, Float32
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import Camera, measured_points
 from kmn_jax.io._exr import parse_exr
+from kmn_jax.io._images import image_header, read_image
 from kmn_jax.io._meshes import CLOUD_SUFFIXES, parse_mesh, read_file
+from kmn_jax.limits import check_bytes, check_elements, most_elements, parse_json
 from kmn_jax.units import METRES, check_unit
 
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
 ARRAY_SUFFIXES = (".npy", ".npz")
+_IMAGE_FORMATS = ("PNG", "TIFF")
 _SATURATED = 65535  # of 16-bit depth, which some readers return as wider numbers: nothing was measured
-_MOST_POINTS = 50_000_000
 _FARTHEST = 1e9  # units: renderers write 1e10 where they see nothing
 _DENSEST = 4096  # bytes of pixels from one byte of a file: compression that does more packs no measurement
 
@@ -110,7 +111,7 @@ def read_camera(path: str | Path) -> DepthCamera:
     path = Path(path)
     content = read_file(path, "a camera file")
     try:
-        found = json.loads(content.decode("utf-8"))
+        found = parse_json(content.decode("utf-8"))
         if not isinstance(found, dict):
             raise ValueError("it is no JSON object")
         scale = float(found.get("depth_scale", 1.0))
@@ -124,7 +125,7 @@ def read_camera(path: str | Path) -> DepthCamera:
         return DepthCamera(fx, fy, cx, cy, scale, size)
     except KeyError as error:
         raise InputError(f"{path} cannot be used: it has no {error}, give fx, fy, cx and cy, or cam_K") from None
-    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path} cannot be used as a camera: {error}") from None
 
 
@@ -148,23 +149,14 @@ def _arrays(content: bytes, suffix: str) -> dict[str, np.ndarray]:
         array = _npy(content)
         return {"depth" if array.ndim == 2 and array.shape[1] not in (3, 6) else "points": array}
     if suffix == ".exr":
-        return {"depth": parse_exr(content, min(_MOST_POINTS, _DENSEST * len(content) // 2))}
+        return {"depth": parse_exr(content, min(most_elements(), _DENSEST * len(content) // 2))}
     return {"depth": _image(content)}
 
 
 def _image(content: bytes) -> np.ndarray:
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with Image.open(io.BytesIO(content), formats=("PNG", "TIFF")) as image:
-                _check_size(image.width * image.height, 2, content)
-                values = np.asarray(image)
-    except InputError:
-        raise
-    except Exception as error:  # each decoder has errors of its own
-        raise InputError(f"it is not a readable image ({type(error).__name__})") from None
+    header = image_header(content, _IMAGE_FORMATS)
+    _check_size(header.width * header.height, 2, content)
+    _, values = read_image(content, _IMAGE_FORMATS)
     if values.ndim != 2 or values.dtype == np.uint8 or values.dtype == bool:
         kind = f"{values.dtype} with {values.shape[2] if values.ndim == 3 else 1} channels"
         raise InputError(f"it holds {kind}, but depth has one channel of 16 bits or more")
@@ -173,8 +165,7 @@ def _image(content: bytes) -> np.ndarray:
 
 def _check_size(count: int, itemsize: int, content: bytes) -> None:
     """Refuse what announces more pixels or points than can be true, before memory is taken for them."""
-    if count > _MOST_POINTS:
-        raise InputError(f"it has {count} pixels or points, more than {_MOST_POINTS}: thin it out")
+    check_elements(count, "pixels or points")
     if count * itemsize > _DENSEST * len(content):
         raise InputError(f"it is damaged: it announces {count} pixels or points, but has {len(content)} bytes")
 
@@ -188,6 +179,8 @@ def _npy(content: bytes) -> np.ndarray:
             version = np.lib.format.read_magic(file)  # later ones hold no plain numbers
             headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
             shape, by_columns, dtype = headers[version](file)
+            if not all(type(size) is int for size in shape):
+                raise ValueError(f"shape {shape}")
     except Exception as error:  # of many kinds: the header is Python text
         raise InputError(f"it is not a readable .npy file ({type(error).__name__}: {str(error)[:80]})") from None
     if dtype.kind not in "fiu":
@@ -200,7 +193,7 @@ def _npy(content: bytes) -> np.ndarray:
 
 
 def _npz(content: bytes) -> dict[str, np.ndarray]:
-    arrays, names = {}, []
+    arrays, names, taken = {}, [], 0
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             for entry in archive.infolist():
@@ -208,7 +201,12 @@ def _npz(content: bytes) -> dict[str, np.ndarray]:
                 names.append(name)
                 if name in ("points", "normals", "depth", "K"):
                     _check_size(entry.file_size // (6 * 8), 6 * 8, content)
-                    arrays[name] = _npy(archive.read(entry))
+                    taken += entry.file_size
+                    check_bytes(taken)
+                    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                        raise InputError(f"its {name} are compressed in a way that NumPy does not write")
+                    with archive.open(entry) as file:
+                        arrays[name] = _npy(file.read(entry.file_size))  # no more, whatever there is
     except InputError:
         raise
     except Exception as error:  # of the archive, and of what unpacks it
@@ -224,8 +222,7 @@ def _cloud(points: np.ndarray, normals: np.ndarray | None, unit: str) -> Scan:
     if points.shape[-1] == 6 and normals is None:
         points, normals = points[..., :3], points[..., 3:]
     rows = points[..., :3].reshape(-1, 3)
-    if len(rows) > _MOST_POINTS:
-        raise InputError(f"it has {len(rows)} points, more than {_MOST_POINTS}: thin it out")
+    check_elements(len(rows))
     if normals is not None and normals.reshape(-1, 3).shape != rows.shape:
         raise InputError(f"its normals have shape {normals.shape}, but its points {points.shape}")
     with np.errstate(over="ignore", invalid="ignore"):
@@ -256,8 +253,7 @@ def depth_scan(values: np.ndarray, camera: DepthCamera, unit: str) -> Scan:
     height, width = values.shape
     if camera.size is not None and camera.size != (width, height):
         raise InputError(f"it has {width} x {height} pixels, but its camera {camera.size[0]} x {camera.size[1]}")
-    if values.size > _MOST_POINTS:
-        raise InputError(f"it has {values.size} pixels, more than {_MOST_POINTS}: make it smaller")
+    check_elements(values.size, "pixels")
     measured = _measured(values)
     if not measured.any():
         raise InputError(f"none of its {height} x {width} pixels was measured: all are zero, NaN or saturated")

@@ -14,6 +14,7 @@ from safetensors.numpy import save
 
 from kmn_jax.errors import InputError
 from kmn_jax.files import read_safetensors, write_whole
+from kmn_jax.limits import parse_json
 from kmn_jax.models._config import KeyMatchNetConfig
 from kmn_jax.models._keymatchnet import Model, model_structure
 
@@ -66,7 +67,7 @@ def load_model(path: str | Path) -> Model:
     if _CONFIG_KEY not in metadata:
         raise InputError(f"{path} carries no kmn_jax config: if it holds published weights, use load_released")
     try:
-        config = KeyMatchNetConfig(**json.loads(metadata[_CONFIG_KEY]))
+        config = KeyMatchNetConfig(**parse_json(metadata[_CONFIG_KEY]))
     except (TypeError, ValueError) as error:
         raise InputError(f"{path} has a config that this version of kmn_jax cannot use: {error}") from None
     graphdef, parameters = model_structure(config)

@@ -17,6 +17,7 @@ from safetensors.numpy import save
 
 from kmn_jax.errors import InputError
 from kmn_jax.files import read_safetensors, write_whole
+from kmn_jax.limits import parse_json
 from kmn_jax.models import Model, encode_object
 from kmn_jax.objects._object_model import ObjectModel
 from kmn_jax.objects._symmetry import Symmetries
@@ -171,7 +172,7 @@ def load_part(path: str | Path, digest: str | None = None) -> Part:
     if metadata.get("format") != _FORMAT:
         raise InputError(f"{path} is no object card of this version: make it again with kmn prepare")
     try:
-        facts = dict(json.loads(metadata["facts"]))
+        facts = dict(parse_json(metadata["facts"]))
         part = _part(tensors, facts)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is a damaged object card ({error}): make it again with kmn prepare") from None

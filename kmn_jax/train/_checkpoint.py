@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from kmn_jax.errors import InputError
+from kmn_jax.limits import parse_json
 from kmn_jax.train._sharding import from_first_process
 from kmn_jax.train._snapshot import Packed, Snapshot, check_fit, pack, unpack
 from kmn_jax.train._step import TrainState
@@ -174,10 +175,10 @@ def _save(path: Path, packed: Packed) -> None:
 
 def _checked_record(path: Path) -> dict[str, Any]:
     """Return the record of a checkpoint, all of whose files are as they were written; else raise any error."""
-    stored = json.loads((path / _RECORD).read_text(encoding="utf-8"))
+    stored = parse_json((path / _RECORD).read_text(encoding="utf-8"))
     if hashlib.sha256(stored["content"].encode()).hexdigest() != stored["sha256"]:
         raise InputError(f"{_RECORD} is not what was written: its SHA-256 differs")
-    content = json.loads(stored["content"])
+    content = parse_json(stored["content"])
     for name, digest in content["files"].items():
         if _sha256(path / name) != digest:
             raise InputError(f"{name} is not what was written: its SHA-256 differs")

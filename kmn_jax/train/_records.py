@@ -19,6 +19,7 @@ import jax
 
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
+from kmn_jax.limits import parse_json
 from kmn_jax.report import commit, processor
 
 COLUMNS = (
@@ -66,7 +67,7 @@ def read_metrics(folder: str | Path) -> list[dict[str, Any]]:
     rows = []
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
-            row = json.loads(line)
+            row = parse_json(line)
         except ValueError:
             continue
         if isinstance(row, dict) and isinstance(row.get("step"), int):
@@ -85,7 +86,7 @@ def check_same(folder: Path, old: Mapping[str, Any], new: Mapping[str, Any], fre
     Dots join the names of nested values. Names that the old one lacks, because an earlier version knew none of them,
     are passed over.
     """
-    old, new = _flat(dict(old)), _flat(json.loads(json.dumps(new)))
+    old, new = _flat(dict(old)), _flat(parse_json(json.dumps(new)))
     changed = [name for name in sorted(old) if old[name] != new.get(name) and name not in free]
     if changed:
         what = ", ".join(f"{name} = {old[name]}, not {new.get(name)}" for name in changed[:4])

@@ -13,6 +13,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from kmn_jax.errors import InputError
+from kmn_jax.limits import parse_json
 from kmn_jax.train._step import TrainState
 
 _FORMAT = "kmn_jax snapshot 1"
@@ -65,7 +66,7 @@ def unpack(packed: Packed, like: TrainState) -> Snapshot:
     leaves, structure = jax.tree.flatten(like)
     placed = [_placed(packed.arrays[name], leaf) for name, leaf in zip(_names(like), leaves, strict=True)]
     state = jax.tree.unflatten(structure, placed)
-    return Snapshot(state, base64.b64decode(packed.record["batches"]), json.loads(packed.record["facts"]))
+    return Snapshot(state, base64.b64decode(packed.record["batches"]), parse_json(packed.record["facts"]))
 
 
 def check_fit(record: dict[str, Any], like: TrainState) -> None:

@@ -141,6 +141,8 @@ OF_A_SCENE: dict[str, tuple[Damage, str, str]] = {
     "missing": (removed(GT), GT, "is missing"),
     "list": (content(GT, b"[]"), GT, "must hold a JSON object"),
     "key": (setting(GT, "first", value=[]), GT, "key 'first': must be an id"),
+    "long key": (setting(GT, "1" * 5000, value=[]), GT, "has more than 18 digits, but must be an id"),
+    "long number": (content(GT, b'{"0": ' + b"9" * 5000 + b"}"), GT, "is not valid JSON"),
     "two keys": (setting(GT, "01", value=[]), GT, "key '01': stands there twice"),
     "same keys": (content(GT, b'{"0": [], "1": [], "0": []}'), GT, "two values for the key '0'"),
     "camera missing": (removed(CAMERA), CAMERA, "is missing"),

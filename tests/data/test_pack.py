@@ -189,7 +189,13 @@ def test_refuses_a_broken_manifest(pack: Pack, change: Callable[[dict], object],
         Pack(pack.folder)
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff\xfe"])
+def test_refuses_an_object_that_the_manifest_calls_otherwise(pack: Pack) -> None:
+    edit_manifest(pack.folder, lambda manifest: manifest["objects"][1].update(name="Family/renamed"))
+    with pytest.raises(InputError, match=r"holds the object 'Family/\w+', but the manifest calls it 'Family/renamed'"):
+        Pack(pack.folder).load("Family/renamed")
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff\xfe", b"[" * 10_000])
 def test_refuses_a_manifest_that_is_not_json(pack: Pack, content: bytes) -> None:
     (pack.folder / "manifest.json").write_bytes(content)
     with pytest.raises(InputError, match=r"manifest\.json is not"):
