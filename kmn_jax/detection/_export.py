@@ -39,6 +39,11 @@ def export_estimator(estimator: PoseEstimator, part: Part, path: str | Path, num
     """
     if not LEAST_POINTS <= num_points <= _MOST:
         raise InputError(f"points is {num_points}, but must be between {LEAST_POINTS} and {_MOST}")
+    if part.origin.any():
+        raise InputError(
+            f"{part.name} lies too far from the origin of its frame for the float32 poses of an exported program: move"
+            " it there"
+        )
     arguments = (
         jax.ShapeDtypeStruct((num_points, 3), jnp.float32),
         jax.ShapeDtypeStruct((num_points,), jnp.bool_),

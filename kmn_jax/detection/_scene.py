@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from kmn_jax.detection._depth_agreement import DepthImage, depth_buffer
 from kmn_jax.detection._foreground import ForegroundOptions, foreground
-from kmn_jax.detection._frames import into
+from kmn_jax.detection._frames import into, placed
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import Camera, PaddedCloud, intrinsics, pad_cloud
-from kmn_jax.io import Scan
+from kmn_jax.io import FAR, Scan
 
 LEAST_POINTS = 4096  # the smallest capacity that is compiled
 MOST_POINTS = 131_072  # of a scan that are searched: more are thinned out at random
@@ -23,6 +23,7 @@ _IMAGE_STEP = 256  # depth images are padded to a multiple of it
 _SIDE = 1024  # pixels along both sides of an image that is made of a cloud: one size, so one compilation
 _SAMPLE = 2000  # points whose spacing is measured
 _NEAREST = 1e-3  # of the distance of the cloud: a sensor nearer than that to a point lies in the cloud
+_FARTHEST = 1e4  # diameters of an object, from the sensor: beyond, float32 does not hold its surface
 _MOST_BEHIND = 0.01  # share of the points: with more behind it, the sensor was not there
 
 
@@ -44,6 +45,11 @@ class Scene:
     truth: tuple[Float[np.ndarray, "4 4"], ...] | None = None  # T_scene_object of all copies, if a dataset says
     bop_ids: tuple[int, int, int] = (0, 0, 1)  # scene, image and object, of an image of a BOP dataset
 
+    def placed(self, points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s 3"]:
+        """Return points of the camera's frame in the scene's: in float32, or float64 if that lies far away."""
+        far = np.abs(self.T_scene_camera[:3, 3]).max() > FAR * np.abs(self.points).max()
+        return placed(self.T_scene_camera, points).astype(np.float64 if far else np.float32)
+
 
 def make_scene(
     scan: Scan,
@@ -64,8 +70,15 @@ def make_scene(
     if sensor is not None and scan.camera is not None:
         raise InputError("a depth image is in the frame of its sensor: leave the sensor's place out")
     view = _seen(scan, sensor)
+    distance = float(np.median(view.points[:, 2]))
+    if distance > _FARTHEST * diameter:
+        raise InputError(
+            f"the scan lies {distance:.3g} {scan.unit} from its sensor, {distance / diameter:.2g} times the object's"
+            " diameter: say where in its frame the sensor was (--sensor), and in which unit"
+        )
     seen = scan
-    if not np.array_equal(view.T_scene_camera, np.eye(4)) or len(view.rows) < len(scan.points):
+    moved = not np.array_equal(view.T_scene_camera, np.eye(4)) or scan.points.dtype != np.float32
+    if moved or len(view.rows) < len(scan.points):
         seen = Scan(view.points, None, None, None, scan.unit)
     warnings: tuple[str, ...] = ()
     if inside is None:
