@@ -113,6 +113,7 @@ class PoseEstimator:
         problem = length_problem(smallest.diameter, smallest.unit, size)
         if problem is not None:
             raise InputError(problem)
+        is_stated = camera is None and isinstance(scan, str | Path) and is_bop_image(scan)
         options = background or ForegroundOptions()
         # Margins are those of the smallest part, but a plane is background only if it is no part's.
         options = replace(options, least_extent=options.least_extent * ratio)
@@ -123,7 +124,7 @@ class PoseEstimator:
         return replace(
             scene,
             warnings=(*self.warnings, *scene.warnings),
-            doubt=length_doubt(smallest.diameter, smallest.unit, size),
+            doubt=None if is_stated else length_doubt(smallest.diameter, smallest.unit, size),
             truth=truth,
             bop_ids=bop_ids,
         )

@@ -13,10 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
-from safetensors.numpy import save
 
 from kmn_jax.errors import InputError
-from kmn_jax.files import read_safetensors, write_whole
+from kmn_jax.files import read_safetensors, safetensors_bytes, write_whole
 from kmn_jax.io import far_origin
 from kmn_jax.models import Model, encode_object
 from kmn_jax.objects._object_model import ObjectModel
@@ -173,10 +172,7 @@ def save_part(part: Part, path: str | Path) -> None:
         "source_digest": part.source_digest,
         "model_digest": part.model_digest,
     }
-    content = save(
-        {name: np.ascontiguousarray(array) for name, array in tensors.items()},
-        metadata={"format": _FORMAT, "facts": json.dumps(facts)},
-    )
+    content = safetensors_bytes(tensors, {"format": _FORMAT, "facts": json.dumps(facts)})
     if len(content) > _LIMIT:
         raise InputError(
             f"the card of {part.name} would have {len(content)} bytes, more than {_LIMIT}: take fewer points"
