@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+from jaxtyping import Float
+
 from kmn_jax.errors import InputError
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}  # one of each unit, in metres
@@ -16,6 +19,7 @@ def check_unit(unit: str) -> str:
     return unit
 
 
-def coordinate_text(value: float, unit: str) -> str:
-    """Return a coordinate for people: four digits, or more if it is a long one."""
-    return f"{value:.4g}" if abs(value) < _LONG else f"{value:.{_DECIMALS[check_unit(unit)]}f}"
+def place_text(place: Float[np.ndarray, "3"], unit: str) -> list[str]:
+    """Return the coordinates of a place for people: four digits of each, or more if one is long."""
+    digits = ".4g" if np.abs(place).max() < _LONG else f".{_DECIMALS[check_unit(unit)]}f"
+    return [format(float(value), digits) for value in place]

@@ -161,7 +161,7 @@ def refined_candidates(
     given = (on_device, scene.cloud, scene.image, config.crops.smooth, config.agreement)
     seeds = found.seed_rows[found.crop[rows]]
     poses, there = call_rows(
-        lambda pose, row, key: refine_one(pose, row, key, *given),
+        lambda pose, row, key: refine_one(pose, row, jax.random.wrap_key_data(key), *given),
         lambda poses, rows, keys: refine_many(poses, rows, keys, *given),
         found.T_camera_object[rows],
         seeds.astype(np.int32),

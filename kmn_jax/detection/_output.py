@@ -12,7 +12,7 @@ import numpy as np
 from kmn_jax.bop import BopEstimate, write_results
 from kmn_jax.detection._result import SCHEMA_VERSION, Detection, Detections
 from kmn_jax.files import write_whole
-from kmn_jax.units import coordinate_text
+from kmn_jax.units import place_text
 
 _COLUMNS = ("rank", "probability", "visible", "gap", "inliers", "x", "y", "z", "rotation vector (degrees)")
 
@@ -91,10 +91,9 @@ def table(found: Detections, accepted: float) -> str:
 
 
 def _row(rank: int, pose: Detection, unit: str) -> tuple[str, ...]:
-    place = (coordinate_text(float(value), unit) for value in pose.T_scene_object[:3, 3])
     turn = ", ".join(f"{angle:.1f}" for angle in np.degrees(_rotation_vector(pose.T_scene_object[:3, :3])))
     numbers = (f"{pose.probability:.2f}", f"{pose.visible_fraction:.2f}", f"{pose.runner_up_gap:.2f}")
-    return (str(rank), *numbers, str(pose.num_inliers), *place, turn)
+    return (str(rank), *numbers, str(pose.num_inliers), *place_text(pose.T_scene_object[:3, 3], unit), turn)
 
 
 def _rotation_vector(rotation: np.ndarray) -> np.ndarray:

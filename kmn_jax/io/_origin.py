@@ -32,10 +32,8 @@ def object_origin(points: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3"]:
     low, high = points.min(axis=0), points.max(axis=0)
     origin, size = far_origin(low, high), float(np.linalg.norm(high - low))
     farthest = float(np.abs(origin).max())
-    if farthest == 0:
-        return origin
-    in_float32 = bool((points.astype(np.float32) == points).all())
-    if farthest > _LOST * size or (in_float32 and np.spacing(np.float32(farthest)) > size / _STEPS):
+    too_coarse = np.spacing(np.float32(farthest)) > size / _STEPS
+    if farthest > _LOST * size or (too_coarse and bool((points.astype(np.float32) == points).all())):
         raise InputError(
             f"it lies {farthest:.3g} from the origin of its frame, but is only {size:.3g} large, and its coordinates"
             " have not enough digits for both: move it to the origin and export it again"

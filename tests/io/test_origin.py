@@ -9,7 +9,7 @@ import pytest
 
 from kmn_jax.errors import InputError
 from kmn_jax.io import far_origin, held, object_origin, read_scan
-from kmn_jax.units import coordinate_text
+from kmn_jax.units import place_text
 
 UTM = np.array([5e5, 5.4e6, 300.0])
 CLOUD = np.random.default_rng(0).uniform(-1, 1, (500, 3))
@@ -57,5 +57,6 @@ def test_no_number_is_too_large_for_a_sentence(tmp_path: Path) -> None:
 
 
 def test_long_coordinates_are_shown_to_a_tenth_of_a_millimetre() -> None:
-    assert [coordinate_text(value, "m") for value in (0.123456, 5.4e6 + 0.1234)] == ["0.1235", "5400000.1234"]
-    assert coordinate_text(-123456.78, "mm") == "-123456.8"
+    assert place_text(np.array([0.123456, 12.3456, 0]), "m") == ["0.1235", "12.35", "0"]
+    assert place_text(np.array([12.34567, 5.4e6 + 0.1234, 0]), "m") == ["12.3457", "5400000.1234", "0.0000"]
+    assert place_text(np.array([-123456.78, 0, 0]), "mm")[0] == "-123456.8"
