@@ -81,7 +81,7 @@ def find_symmetries(
     axes = np.concatenate([vectors.T, _sphere_directions(1500)]) if isotropic else vectors.T
     spins: list[_Spin] = []
     for prime in (5, 3, 2) if isotropic else _PRIMES:
-        for start in search.nearly(axes, prime):
+        for start in search.nearly(axes, prime) if not search.is_spent else ():
             if search.is_spent:
                 break
             if any(abs(start @ axis) > _SAME_AXIS and order % prime == 0 for axis, order in spins):
