@@ -25,7 +25,6 @@ from kmn_jax.detection import (
     table,
 )
 from kmn_jax.errors import InputError
-from kmn_jax.geometry import measured_points
 from kmn_jax.io import Scan, read_mesh
 from kmn_jax.objects import Part, save_part
 from kmn_jax.pose import adi, mssd
@@ -213,24 +212,6 @@ def test_a_scan_without_the_part_is_an_empty_or_doubtful_result(estimator: PoseE
     reason = strict.detect(motor, scene, at=wavy[:2]).reason
     assert reason is not None
     assert reason.endswith("; say --units cm")
-
-
-def test_scans_of_other_sizes_compile_nothing(estimator: PoseEstimator, motor: Part) -> None:
-    scan, truth = bin_of(0)
-    assert scan.depth is not None
-    near = scan.points[np.linalg.norm(scan.points - truth[0][:3, 3], axis=1) < motor.diameter]
-    whole = ForegroundOptions(remove_plane="never")
-    depth = np.where(np.indices(scan.depth.shape).sum(axis=0) % 3 == 0, scan.depth, 0)
-    box = ForegroundOptions(roi=tuple(float(x) for x in (*near.min(axis=0), *near.max(axis=0))), remove_plane="never")
-    camera = scan.camera
-    assert camera is not None
-    smaller = replace(camera, width=camera.width - 7, height=camera.height - 9)
-    image = replace(scan, depth=depth[:-9, :-7], camera=smaller, points=measured_points(depth[:-9, :-7], smaller))
-    estimator.detect(motor, near, unit="mm", background=whole)
-    for other, given in ((near[::3], whole), (near[::9], whole), (image, box)):
-        found = estimator.detect(motor, other, unit="mm", background=given)
-        assert found.timing.compile == 0, f"{found.timing}"
-        assert len(found.poses) >= 1
 
 
 def test_parts_and_scans_may_lie_far_from_the_origin(estimator: PoseEstimator, motor: Part) -> None:
