@@ -147,7 +147,7 @@ def made_with() -> dict[str, str]:
 
 def metric_model(path: Path) -> ObjectModel:
     """Return a part in metres; files that state no unit are in millimetres."""
-    return load_object(path).in_unit("m")
+    return load_object(path).in_unit("m").centred()
 
 
 def _write_scene(folder: Path, object_id: int, config: PackConfig, sensor: SensorConfig, source: Source) -> None:

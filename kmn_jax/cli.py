@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
+import re
 import sys
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -281,6 +285,41 @@ def _joined(arguments: list[str]) -> list[str]:
     return result
 
 
+def _parsed(arguments: list[str]) -> Callable[[], None]:
+    """Return the command that the arguments ask for, to be run; raise InputError, in one sentence, for wrong ones."""
+
+    def later(call: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+        return wraps(call)(lambda *values, **named: partial(call, *values, **named))
+
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            commands: dict[str, Any] = {call.__name__: later(call) for call in (prepare, detect, view, export, convert)}
+            chosen: Callable[[], None] = tyro.extras.subcommand_cli_from_dict(commands, prog="kmn", args=arguments)
+            return chosen
+    except SystemExit as error:
+        if not error.code:  # of --help
+            raise
+    raise InputError(_sentence(said.getvalue()))
+
+
+def _sentence(box: str) -> str:
+    """Return what a box of the parser says of wrong arguments in one sentence, without the help texts in it."""
+    box = re.sub(r"\x1b\[[\d;]*m", "", box)  # colours
+    lines = [line[2:-1].rstrip() for line in box.splitlines()[1:] if not line.startswith("╰")]  # below its title
+    parts: list[list[str]] = [[]]
+    for line in lines:
+        if re.fullmatch("[─-]{3,}", line):
+            parts.append([])
+        elif not line:  # what follows are details
+            break
+        elif not line.startswith(" " * 5):  # where help texts are
+            parts[-1].append(line.strip())
+    said = "; ".join(" ".join(part).rstrip(".") for part in parts if part and not part[0].startswith("For full help"))
+    helped = re.search(r"kmn(?: \w+)? --help", box)
+    return f"{said or box.strip()}: see {helped[0] if helped else 'kmn --help'}"
+
+
 def _keep_compiled() -> None:
     """Let JAX keep compiled programs between calls, in the user's cache unless told another place.
 
@@ -300,10 +339,10 @@ def _keep_compiled() -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line: 0 is success, 2 bad input (one sentence on stderr), 1 our own failure."""
     arguments = _joined(sys.argv[1:] if arguments is None else arguments)
-    commands: dict[str, Any] = {call.__name__: call for call in (prepare, detect, view, export, convert)}
     try:
+        run = _parsed(arguments)
         _keep_compiled()
-        tyro.extras.subcommand_cli_from_dict(commands, prog="kmn", args=arguments)
+        run()
         sys.stdout.flush()
     except BrokenPipeError:  # nobody reads on, as in `kmn detect ... | head -1`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

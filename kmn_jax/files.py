@@ -1,8 +1,9 @@
-"""Writing files that appear complete or not at all; reading safetensors files."""
+"""Writing files that appear complete or not at all; safetensors files."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import secrets
@@ -14,6 +15,7 @@ from typing import BinaryIO
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 
 from kmn_jax.errors import InputError
 
@@ -87,6 +89,18 @@ def check_output(path: Path, *read: Path | None) -> None:
         raise InputError(f"cannot write {path}: no permission")
     if any(source is not None and source.exists() and target.exists() and source.samefile(target) for source in read):
         raise InputError(f"cannot write {path}: it is read, too, and would be lost; name another file")
+
+
+def safetensors_bytes(tensors: dict[str, np.ndarray], metadata: dict[str, str] | None = None) -> bytes:
+    """Return the content of a .safetensors file: the same tensors and metadata make the same bytes."""
+    content = save({name: np.ascontiguousarray(array) for name, array in tensors.items()}, metadata)
+    start = 8 + int.from_bytes(content[:8], "little")
+    header = json.loads(content[8:start])
+    if metadata:  # which come in no order
+        header["__metadata__"] = dict(sorted(metadata.items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + content[start:]
 
 
 def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -49,3 +50,34 @@ def test_command_is_installed_and_explains_itself() -> None:
     assert result.returncode == 0, result.stderr
     assert "authors" in result.stdout
     assert subprocess.run([program, "convert", "only-one"], capture_output=True).returncode == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("", "Expected one of {prepare, detect, view, export, convert}: see kmn --help"),
+        ("nope", "Unrecognized options: nope"),
+        ("detect", "Missing from kmn detect: --object PATH --scene PATH: see kmn detect --help"),
+        ("detect --objct a --scene b", "Missing from kmn detect: --object PATH; Unrecognized options: --objct a"),
+        ("prepare", "Missing from kmn prepare: PATH"),
+        ("prepare a b", "Unrecognized options: b"),
+        ("detect --object a --scene b --top x", "Error parsing --top: "),
+        ("detect --object a --scene b --plane x", "invalid choice 'x' for argument '--plane'"),
+    ],
+)
+def test_wrong_arguments_are_one_sentence(arguments: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments.split()) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith(f"kmn: {said}")
+    assert printed.err.endswith("--help\n")
+    assert printed.err.count("\n") == 1
+
+
+def test_an_interrupt_while_libraries_load_leaves_no_traceback(tmp_path: Path) -> None:
+    (tmp_path / "tyro.py").write_text("raise KeyboardInterrupt")
+    paths = os.pathsep.join([str(tmp_path), str(Path(__file__).parent.parent)])
+    done = subprocess.run(
+        [sys.executable, "-m", "kmn_jax", "--help"], env=os.environ | {"PYTHONPATH": paths}, capture_output=True
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, b"", b"")

@@ -9,10 +9,11 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from kmn_jax.errors import InputError
-from kmn_jax.files import check_output, write_whole
+from kmn_jax.files import check_output, read_safetensors, safetensors_bytes, write_whole
 
 
 def test_file_appears_whole_and_replaces(tmp_path: Path) -> None:
@@ -112,3 +113,15 @@ def test_what_cannot_be_written_is_told_before(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=text):
             check_output(target, source)
+
+
+def test_the_same_tensors_make_the_same_bytes(tmp_path: Path) -> None:
+    tensors = {"b": np.arange(6.0).reshape(2, 3), "a": np.ones((0, 3), np.float32), "c": np.arange(3, dtype=np.uint8)}
+    metadata = {name: f'"{name}" \u00fc\n' for name in "hgfedcba"}
+    contents = {safetensors_bytes(tensors, metadata) for _ in range(20)}
+    assert len(contents) == 1
+    (tmp_path / "x.safetensors").write_bytes(contents.pop())
+    found, facts = read_safetensors(tmp_path / "x.safetensors")
+    assert facts == metadata
+    assert found.keys() == tensors.keys()
+    assert all((found[name] == tensor).all() and found[name].dtype == tensor.dtype for name, tensor in tensors.items())

@@ -128,7 +128,7 @@ def cloud_objects(
             read_file(given, what)
     files = scans_with_poses(folder, cad)
     path = cad or mesh_of(folder)
-    model = load_object(path, unit, OBJECT).in_unit(UNIT)
+    model = load_object(path, unit, OBJECT).near().in_unit(UNIT)
     images = CloudImages(model, tuple(_spread(files, most_images)), camera or camera_of(folder), unit, sensor)
     return [ObjectImages(path.stem, model, images)]
 

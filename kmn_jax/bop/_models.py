@@ -32,9 +32,10 @@ def write_models(folder: str | Path, models: Mapping[int, ObjectModel]) -> None:
     """Write objects by id as PLY meshes with vertex normals, their sizes and symmetries, and their names.
 
     Vertices are stored in float32 millimetres. An object without triangles is written as a cloud. Raises InputError
-    for an id below 1, and if the folder cannot be written to.
+    for an id below 1, for an object too far from its frame's origin, and if the folder cannot be written to.
     """
-    for object_id in models:
+    for object_id, model in models.items():
+        model.near()
         if object_id < 1:
             raise InputError(f"models: object id {object_id} must be 1 or more")
     target = Path(folder) / "models"

@@ -214,7 +214,7 @@ def load_models(
             path = dataset.model(object_id).path
             if path is None:
                 raise InputError(f"object {object_id} has no mesh in {dataset.folder / dataset.models_folder}")
-            models[object_id] = load_object(path, "mm", config).in_unit(dataset.unit)
+            models[object_id] = load_object(path, "mm", config).near().in_unit(dataset.unit)
         except InputError as error:
             problems.append(str(error))
     return models, tuple(problems)

@@ -15,10 +15,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int8, Int16, UInt8
-from safetensors.numpy import save
 
 from kmn_jax.errors import InputError
-from kmn_jax.files import read_safetensors, write_whole
+from kmn_jax.files import read_safetensors, safetensors_bytes, write_whole
 from kmn_jax.geometry import Camera
 from kmn_jax.limits import parse_json
 from kmn_jax.simulate import Bin, BinScene
@@ -214,7 +213,7 @@ def _check_inside(path: str) -> None:
 
 
 def _write_shard(folder: Path, kind: str, name: str, tensors: dict[str, np.ndarray], metadata: dict[str, str]) -> Shard:
-    content = save(tensors, metadata)
+    content = safetensors_bytes(tensors, metadata)
     relative = Path(kind) / f"{name}.safetensors"
     (folder / relative).parent.mkdir(parents=True, exist_ok=True)
     write_whole(folder / relative, content)

@@ -71,9 +71,8 @@ def pack_object(
     is broken or a drop is not accepted.
     """
     times = [time.perf_counter()]
-    model = load_object(path, config=ObjectConfig(num_points=config.surfels, random_seed=config.random_seed)).in_unit(
-        "m"
-    )
+    made = load_object(path, config=ObjectConfig(num_points=config.surfels, random_seed=config.random_seed))
+    model = made.in_unit("m").centred()
     times.append(time.perf_counter())
     shape = collision_shape(model.vertices, model.triangles, config.hulls) if config.drops else None
     times.append(time.perf_counter())

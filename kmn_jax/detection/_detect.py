@@ -109,14 +109,14 @@ def detect(
         poses = detections(found, choice, calibration, part, scene)
         accepted = choice.kept & (calibration.probability(found.evidence) >= config.accepted)
         left = unexplained(scene.foreground, scene, part, found.T_camera_object[accepted])
-        share, points = left.sum() / scene.foreground.sum(), placed(scene.T_scene_camera, scene.points[left])
+        share, points = left.sum() / scene.foreground.sum(), scene.placed(scene.points[left])
     reason = None if poses else "; ".join(filter(None, (_reason(found, part), scene.doubt)))
     result = Detections(part.name, scene.unit, poses, clock.timing, reason, warnings)
     if at is not None:
         return result
     if not scene.is_narrowed:
         warnings = (*warnings, *narrowing(found.evidence[accepted], float(share)))
-    return replace(result, warnings=warnings, unexplained=float(share), unexplained_points=points.astype(np.float32))
+    return replace(result, warnings=warnings, unexplained=float(share), unexplained_points=points)
 
 
 def explore(
@@ -163,7 +163,7 @@ def refined_candidates(
     given = (on_device, scene.cloud, scene.image, config.crops.smooth, config.agreement)
     seeds = found.seed_rows[found.crop[rows]]
     poses, there = call_rows(
-        lambda pose, row, key: refine_one(pose, row, key, *given),
+        lambda pose, row, key: refine_one(pose, row, jax.random.wrap_key_data(key), *given),
         lambda poses, rows, keys: refine_many(poses, rows, keys, *given),
         found.T_camera_object[rows],
         seeds.astype(np.int32),
@@ -242,7 +242,7 @@ def _detection(row: int, probability: float, gap: float, found: Candidates, part
         visible_fraction=1 - shares["occluded"],
         runner_up_gap=gap,
         seed=placed(scene.T_scene_camera, np.asarray(found.found.seed[found.crop[row]])),
-        prediction=replace(prediction, points=placed(scene.T_scene_camera, prediction.points).astype(np.float32)),
+        prediction=replace(prediction, points=scene.placed(prediction.points)),
         warnings=tuple(text for text, holds in notes if holds),
         **shares,
     )

@@ -16,11 +16,11 @@ from kmn_jax.detection._detect import DetectConfig, detect
 from kmn_jax.detection._evidence import EVIDENCE
 from kmn_jax.detection._foreground import ForegroundOptions
 from kmn_jax.detection._frames import into
-from kmn_jax.detection._result import Detections
+from kmn_jax.detection._result import Detection, Detections
 from kmn_jax.detection._scene import Scene, make_scene, nearest_row
 from kmn_jax.detection._timing import Clock
 from kmn_jax.errors import InputError, float_array
-from kmn_jax.io import Scan, length_doubt, length_problem, read_scan, resolve_unit, scene_size
+from kmn_jax.io import Scan, held, length_doubt, length_problem, read_scan, resolve_unit, scene_size
 from kmn_jax.models import Model, load_model, released_file
 from kmn_jax.objects import (
     ObjectConfig,
@@ -113,15 +113,18 @@ class PoseEstimator:
         problem = length_problem(smallest.diameter, smallest.unit, size)
         if problem is not None:
             raise InputError(problem)
+        is_stated = camera is None and isinstance(scan, str | Path) and is_bop_image(scan)
         options = background or ForegroundOptions()
         # Margins are those of the smallest part, but a plane is background only if it is no part's.
         options = replace(options, least_extent=options.least_extent * ratio)
         diameter = smallest.in_unit(read.unit).diameter
+        if sensor is not None:
+            float_array(np.asarray(sensor, dtype=np.float64), "sensor", (3,))
         scene = make_scene(read, diameter, sensor=sensor, background=options, keep=_places(at))
         return replace(
             scene,
             warnings=(*self.warnings, *scene.warnings),
-            doubt=length_doubt(smallest.diameter, smallest.unit, size),
+            doubt=None if is_stated else length_doubt(smallest.diameter, smallest.unit, size),
             truth=truth,
             bop_ids=bop_ids,
         )
@@ -214,23 +217,37 @@ class PoseEstimator:
             _check_near(scene, places, max(one.in_unit(scene.unit).diameter for one in parts))
         results = []
         for one in parts:
+            inside = one.in_unit(scene.unit)
             found = detect(
                 self.model,
                 self.probabilities,
-                one.in_unit(scene.unit),
+                inside.centred(),
                 scene,
                 random_seed,
                 self.config,
                 places,
                 clock,
             )
-            results.append(replace(found, poses=found.poses[:top]))
+            poses = tuple(_of_own_frame(pose, inside.origin) for pose in found.poses[:top])
+            results.append(replace(found, poses=poses))
             clock = Clock()
         return results[0] if isinstance(part, Part) else tuple(results)
 
 
+def _of_own_frame(pose: Detection, origin: Float[np.ndarray, "3"]) -> Detection:
+    """Return the pose of a part's own frame for that of a frame with its `origin`, which is zero for most."""
+    if not origin.any():
+        return pose
+    T = pose.T_scene_object.copy()
+    T[:3, 3] -= T[:3, :3] @ origin
+    return replace(pose, T_scene_object=T)
+
+
 def _places(at: Float[np.ndarray, "*k 3"] | None) -> Float[np.ndarray, "k 3"] | None:
-    return None if at is None else np.asarray(float_array(np.atleast_2d(at), "at", (None, 3)), dtype=float)
+    if at is None:
+        return None
+    float_array(np.atleast_2d(at), "at", (None, 3))
+    return np.atleast_2d(np.asarray(at, dtype=np.float64))
 
 
 def _check_near(scene: Scene, places: Float[np.ndarray, "k 3"], reach: float) -> None:
@@ -266,11 +283,11 @@ def _read(
             return scan, None, ids
         copies = [instance for instance in instances or () if instance.object_id == alike[0]]
         return scan, tuple(instance.T_camera_object for instance in copies), ids
-    array = np.asarray(float_array(source, "scan", (None, 3), finite=False), dtype=np.float32)
-    real = np.isfinite(array).all(axis=1) & (array != 0).any(axis=1)
+    single = np.asarray(float_array(source, "scan", (None, 3), finite=False), dtype=np.float32)
+    real = np.isfinite(single).all(axis=1) & (single != 0).any(axis=1)
     if not real.any():
-        raise InputError(f"none of the scan's {len(array)} points was measured: all are NaN, infinite or zero")
-    return Scan(array[real], None, None, None, resolve_unit(asked, part.unit)), None, nothing
+        raise InputError(f"none of the scan's {len(single)} points was measured: all are NaN, infinite or zero")
+    return Scan(held(np.asarray(source)[real]), None, None, None, resolve_unit(asked, part.unit)), None, nothing
 
 
 def _object(source: PartSource, unit: str | None, name: str | None) -> ObjectModel:

@@ -15,7 +15,6 @@ from kmn_jax.detection._bin_program import BinPosesConfig, device_calibration, p
 from kmn_jax.detection._depth_agreement import DepthImage, depth_buffer
 from kmn_jax.detection._device_part import device_part
 from kmn_jax.detection._estimator import PoseEstimator
-from kmn_jax.detection._scene import LEAST_POINTS
 from kmn_jax.detection._seeds import NUM_SEEDS
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
@@ -24,7 +23,7 @@ from kmn_jax.objects import Part
 
 PLATFORMS = ("cpu", "cuda")
 _SIDE = 512  # pixels along the depth image that is made of the points
-_MOST = 2**20
+_LEAST, _MOST = 2**12, 2**20  # points
 
 
 def export_estimator(estimator: PoseEstimator, part: Part, path: str | Path, num_points: int = 65_536) -> int:
@@ -37,8 +36,13 @@ def export_estimator(estimator: PoseEstimator, part: Part, path: str | Path, num
     round, unlike `PoseEstimator.detect`. Raises InputError if the number of points is out of range or the file cannot
     be written.
     """
-    if not LEAST_POINTS <= num_points <= _MOST:
-        raise InputError(f"points is {num_points}, but must be between {LEAST_POINTS} and {_MOST}")
+    if not _LEAST <= num_points <= _MOST:
+        raise InputError(f"points is {num_points}, but must be between {_LEAST} and {_MOST}")
+    if part.origin.any():
+        raise InputError(
+            f"{part.name} lies too far from the origin of its frame for the float32 poses of an exported program: move"
+            " it there"
+        )
     arguments = (
         jax.ShapeDtypeStruct((num_points, 3), jnp.float32),
         jax.ShapeDtypeStruct((num_points,), jnp.bool_),

@@ -149,7 +149,7 @@ def foreground(
 
 def _box_of(points: Float[np.ndarray, "n 3"], unit: str) -> str:
     low, high = points.min(axis=0), points.max(axis=0)
-    ranges = (f"{axis} from {a:g} to {b:g}" for axis, a, b in zip("xyz", low, high, strict=True))
+    ranges = (f"{axis} from {a:.7g} to {b:.7g}" for axis, a, b in zip("xyz", low, high, strict=True))
     return f"the scan has {', '.join(ranges)} {unit}"
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from kmn_jax.bop import BopEstimate, write_results
 from kmn_jax.detection._result import SCHEMA_VERSION, Detection, Detections
 from kmn_jax.files import write_whole
+from kmn_jax.units import place_text
 
 _COLUMNS = ("rank", "probability", "visible", "gap", "inliers", "x", "y", "z", "rotation vector (degrees)")
 
@@ -75,7 +76,7 @@ def table(found: Detections, accepted: float) -> str:
     if found.poses:
         likely = sum(pose.probability >= accepted for pose in found.poses)
         lines.append(f"{found.part}: {likely} found, {len(found.poses) - likely} doubtful (lengths in {found.unit})")
-        rows = [_COLUMNS, *(_row(rank, pose) for rank, pose in enumerate(found.poses, start=1))]
+        rows = [_COLUMNS, *(_row(rank, pose, found.unit) for rank, pose in enumerate(found.poses, start=1))]
         widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
         lines += ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
         lines += sorted({f"note: {warning}" for pose in found.poses for warning in pose.warnings})
@@ -89,11 +90,10 @@ def table(found: Detections, accepted: float) -> str:
     return "\n".join(lines)
 
 
-def _row(rank: int, pose: Detection) -> tuple[str, ...]:
-    x, y, z = pose.T_scene_object[:3, 3]
+def _row(rank: int, pose: Detection, unit: str) -> tuple[str, ...]:
     turn = ", ".join(f"{angle:.1f}" for angle in np.degrees(_rotation_vector(pose.T_scene_object[:3, :3])))
     numbers = (f"{pose.probability:.2f}", f"{pose.visible_fraction:.2f}", f"{pose.runner_up_gap:.2f}")
-    return (str(rank), *numbers, str(pose.num_inliers), f"{x:.4g}", f"{y:.4g}", f"{z:.4g}", turn)
+    return (str(rank), *numbers, str(pose.num_inliers), *place_text(pose.T_scene_object[:3, 3], unit), turn)
 
 
 def _rotation_vector(rotation: np.ndarray) -> np.ndarray:

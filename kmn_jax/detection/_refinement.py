@@ -15,7 +15,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from kmn_jax.detection._depth_agreement import DepthAgreementConfig, DepthImage, depth_agreement
 from kmn_jax.detection._device_part import DevicePart
@@ -142,7 +142,7 @@ def refine_one(
 def refine_many(
     poses: Float[Array, "k 4 4"],
     rows: Int[Array, " k"],
-    keys: Key[Array, " k"],
+    keys: UInt32[Array, "k 2"],
     part: DevicePart,
     cloud: PaddedCloud,
     image: DepthImage,
@@ -154,7 +154,7 @@ def refine_many(
     def one(pose: Pose, row: Int[Array, ""], key: PRNGKey) -> tuple[Float[Array, "a 4 4"], Bool[Array, " a"]]:
         return refine_one(pose, row, key, part, cloud, image, smooth, agreement)
 
-    return jax.vmap(one)(poses, rows, keys)
+    return jax.vmap(one)(poses, rows, jax.random.wrap_key_data(keys))
 
 
 _crop = partial(jax.jit, static_argnames=("num_points", "min_points"))(crop_around)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Int
 
 SCHEMA_VERSION = 1  # of the JSON form, see docs/detect.md
 
@@ -14,7 +14,7 @@ SCHEMA_VERSION = 1  # of the JSON form, see docs/detect.md
 class CropPrediction:
     """What the network says of the n points around a seed."""
 
-    points: Float32[np.ndarray, "n 3"]  # in the scene's frame
+    points: Float[np.ndarray, "n 3"]  # in the scene's frame; float64 if its origin is far away
     on_object: Bool[np.ndarray, " n"]  # taken for the copy that the seed is on
     keypoint: Int[np.ndarray, " n"]  # the likeliest; means nothing where on_object is false
 
@@ -64,4 +64,4 @@ class Detections:
     reason: str | None = None  # why there are no poses, in one sentence; None if there are
     warnings: tuple[str, ...] = field(default_factory=tuple)  # about the scene
     unexplained: float | None = None  # share of the foreground on no pose that counts as found; None: of places alone
-    unexplained_points: Float32[np.ndarray, "u 3"] | None = None  # those points, in the scene's frame
+    unexplained_points: Float[np.ndarray, "u 3"] | None = None  # those points, in the scene's frame

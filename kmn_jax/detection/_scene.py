@@ -12,17 +12,18 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from kmn_jax.detection._depth_agreement import DepthImage, depth_buffer
 from kmn_jax.detection._foreground import ForegroundOptions, foreground
-from kmn_jax.detection._frames import into
+from kmn_jax.detection._frames import into, placed
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import Camera, PaddedCloud, intrinsics, pad_cloud
-from kmn_jax.io import Scan
+from kmn_jax.io import FAR, Scan
 
-LEAST_POINTS = 4096  # the smallest capacity that is compiled
-MOST_POINTS = 131_072  # of a scan that are searched: more are thinned out at random
-_IMAGE_STEP = 256  # depth images are padded to a multiple of it
+MOST_POINTS = 131_072  # of a scan that are searched: more are thinned out at random, fewer are padded
+# Depth images are padded to so many pixels, or else to a multiple of the step: one size compiles nothing for the next.
+_IMAGE_SHAPE, _IMAGE_STEP = (1024, 1280), 1024
 _SIDE = 1024  # pixels along both sides of an image that is made of a cloud: one size, so one compilation
 _SAMPLE = 2000  # points whose spacing is measured
 _NEAREST = 1e-3  # of the distance of the cloud: a sensor nearer than that to a point lies in the cloud
+_FARTHEST = 1e4  # diameters of an object, from the sensor: beyond, float32 does not hold its surface
 _MOST_BEHIND = 0.01  # share of the points: with more behind it, the sensor was not there
 
 
@@ -44,6 +45,11 @@ class Scene:
     truth: tuple[Float[np.ndarray, "4 4"], ...] | None = None  # T_scene_object of all copies, if a dataset says
     bop_ids: tuple[int, int, int] = (0, 0, 1)  # scene, image and object, of an image of a BOP dataset
 
+    def placed(self, points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s 3"]:
+        """Return points of the camera's frame in the scene's: in float32, or float64 if that lies far away."""
+        far = np.abs(self.T_scene_camera[:3, 3]).max() > FAR * np.abs(self.points).max()
+        return placed(self.T_scene_camera, points).astype(np.float64 if far else np.float32)
+
 
 def make_scene(
     scan: Scan,
@@ -64,8 +70,15 @@ def make_scene(
     if sensor is not None and scan.camera is not None:
         raise InputError("a depth image is in the frame of its sensor: leave the sensor's place out")
     view = _seen(scan, sensor)
+    distance = float(np.median(view.points[:, 2]))
+    if distance > _FARTHEST * diameter:
+        raise InputError(
+            f"the scan lies {distance:.3g} {scan.unit} from its sensor, {distance / diameter:.2g} times the object's"
+            " diameter: say where in its frame the sensor was (--sensor), and in which unit"
+        )
     seen = scan
-    if not np.array_equal(view.T_scene_camera, np.eye(4)) or len(view.rows) < len(scan.points):
+    moved = not np.array_equal(view.T_scene_camera, np.eye(4)) or scan.points.dtype != np.float32
+    if moved or len(view.rows) < len(scan.points):
         seen = Scan(view.points, None, None, None, scan.unit)
     warnings: tuple[str, ...] = ()
     if inside is None:
@@ -76,10 +89,14 @@ def make_scene(
         raise InputError("no point of the scan is left as foreground: check background, region and units")
     rows = _thinned(front)
     if keep is not None:
-        rows = np.union1d(rows, [nearest_row(view.points, place) for place in into(view.T_scene_camera, keep)])
+        kept = np.unique([nearest_row(view.points, place) for place in into(view.T_scene_camera, keep)])
+        rows = np.union1d(rows[~np.isin(rows, kept)][: max(0, MOST_POINTS - len(kept))], kept)
     points = view.points[rows]
-    spare = (-size % _IMAGE_STEP for size in view.depth.shape)
-    padded = np.pad(view.depth, [(0, size) for size in spare])
+    wanted = (
+        least if size <= least else size + -size % _IMAGE_STEP
+        for size, least in zip(view.depth.shape, _IMAGE_SHAPE, strict=True)
+    )
+    padded = np.pad(view.depth, [(0, size - own) for size, own in zip(wanted, view.depth.shape, strict=True)])
     return Scene(
         scan.unit,
         view.T_scene_camera,
@@ -87,7 +104,7 @@ def make_scene(
         view.depth,
         points,
         front[rows],
-        pad_cloud(points, LEAST_POINTS),
+        pad_cloud(points, MOST_POINTS),
         DepthImage(jnp.asarray(padded), intrinsics(view.camera)),
         warnings,
         inside is not None or (background is not None and (background.background or background.roi) is not None),
@@ -130,8 +147,17 @@ def _seen(scan: Scan, sensor: Float[np.ndarray, "3"] | None) -> _Seen:
     camera = _fine_camera(points)
     T_scene_camera = np.eye(4)
     T_scene_camera[:3, :3], T_scene_camera[:3, 3] = rotation.T, place
-    depth = _depth_buffer(*pad_cloud(points), intrinsics(camera), shape=(camera.height, camera.width))
-    return _Seen(T_scene_camera, points, np.asarray(depth), camera, rows)
+    return _Seen(T_scene_camera, points, _depth_of(points, camera), camera, rows)
+
+
+def _depth_of(points: Float32[np.ndarray, "n 3"], camera: Camera) -> Float32[np.ndarray, "h w"]:
+    """Return the depth image of a cloud, made of pieces of one size."""
+    nearest = np.full((camera.height, camera.width), np.inf, dtype=np.float32)
+    for start in range(0, len(points), MOST_POINTS):
+        piece = pad_cloud(points[start : start + MOST_POINTS], MOST_POINTS)
+        depth = np.asarray(_depth_buffer(*piece, intrinsics(camera), shape=nearest.shape))
+        nearest = np.where(depth > 0, np.minimum(depth, nearest), nearest)
+    return np.where(np.isfinite(nearest), nearest, np.float32(0))
 
 
 def _towards(direction: Float[np.ndarray, "3"], typical: float) -> Float[np.ndarray, "3 3"]:

@@ -7,10 +7,9 @@ from functools import partial
 from typing import Any, NamedTuple, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Array, ArrayLike, Bool, Float, Float32, Int, Key
+from jaxtyping import Array, ArrayLike, Bool, Float, Float32, Int, UInt32
 
 from kmn_jax.detection._crop_search import (
     CropPoses,
@@ -29,6 +28,8 @@ from kmn_jax.geometry import Crop, PaddedCloud
 from kmn_jax.models import Model
 from kmn_jax.objects import PartArrays
 from kmn_jax.typing import PRNGKey
+
+_KEYS = 128  # that are made at once
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def search_at(
     keys = seed_keys(rows, random_seed)
     given = (*model, part, scene.cloud, scene.image)
     found, evidence = call_rows(
-        partial(search_one, *given, config=config),
+        lambda row, key: search_one(*given, row, jax.random.wrap_key_data(key), config),
         partial(_search_many, *given, config=config),
         rows.astype(np.int32),
         keys,
@@ -78,12 +79,12 @@ def poses_at(
     model: Model, part: PartArrays, cloud: PaddedCloud, row: int, random_seed: int, config: CropSearchConfig
 ) -> CropPoses:
     """Return the poses around the point in a row of a cloud, as a search of a scene of these points finds them."""
-    return _poses_around(*model, part, cloud, np.int32(row), seed_keys(np.array([row]), random_seed)[0], config)
+    return _poses_around(*model, part, cloud, np.int32(row), _seed_key(row, random_seed), config)
 
 
 def seed_crop(part: PartArrays, cloud: PaddedCloud, row: int, random_seed: int, config: CropSearchConfig) -> Crop:
     """Return the crop that `poses_at` with the same arguments searches."""
-    crop_key, _ = jax.random.split(seed_keys(np.array([row]), random_seed)[0])
+    crop_key, _ = jax.random.split(_seed_key(row, random_seed))
     return crop_of_scene(cloud, np.int32(row), part.diameter, crop_key, config)
 
 
@@ -101,9 +102,15 @@ def _poses_around(
     return find_poses_in_crop(graphdef, parameters, part, crop, pose_key, config)
 
 
-def seed_keys(rows: Int[np.ndarray, " c"], random_seed: int) -> Key[Array, " c"]:
-    """Return the random key of each seed."""
-    return _keys(jax.random.key(random_seed), jnp.asarray(rows, dtype=jnp.int32))
+def seed_keys(rows: Int[np.ndarray, " c"], random_seed: int) -> UInt32[np.ndarray, "c 2"]:
+    """Return the data of each seed's random key, see `jax.random.wrap_key_data`."""
+    padded = np.zeros(len(rows) + -len(rows) % _KEYS, dtype=np.int32)  # few numbers are ever compiled
+    padded[: len(rows)] = rows
+    return np.asarray(_keys(jax.random.key(random_seed), padded))[: len(rows)]
+
+
+def _seed_key(row: int, random_seed: int) -> PRNGKey:
+    return jax.random.wrap_key_data(seed_keys(np.array([row]), random_seed)[0])
 
 
 def candidates_of(found: CropPoses, evidence: Float[np.ndarray, "c h f"], rows: Int[np.ndarray, " c"]) -> Candidates:
@@ -171,15 +178,15 @@ def _search_many(
     cloud: PaddedCloud,
     image: DepthImage,
     rows: Int[Array, " c"],
-    keys: Key[Array, " c"],
+    keys: UInt32[Array, "c 2"],
     config: SearchConfig,
 ) -> tuple[CropPoses, Float[Array, "c h f"]]:
     def one(row: Int[Array, ""], key: PRNGKey) -> tuple[CropPoses, Float[Array, "h f"]]:
         return search_one(graphdef, parameters, part, cloud, image, row, key, config)
 
-    return jax.vmap(one)(rows, keys)
+    return jax.vmap(one)(rows, jax.random.wrap_key_data(keys))
 
 
 @jax.jit
-def _keys(key: PRNGKey, rows: Int[Array, " c"]) -> Key[Array, " c"]:
-    return jax.vmap(lambda row: jax.random.fold_in(key, row))(rows)
+def _keys(key: PRNGKey, rows: Int[Array, " c"]) -> UInt32[Array, "c 2"]:
+    return jax.random.key_data(jax.vmap(lambda row: jax.random.fold_in(key, row))(rows))

@@ -35,6 +35,7 @@ _USUAL_EXTENT, _USUAL_DISTANCE = (0.7, 20.0), (3.0, 40.0)
 _USUAL_SIZES = {"object": (0.003, 0.5), "scene": (0.03, 2.0), "distance": (0.15, 3.0)}
 _RARE = {"mm": 0.0, "m": 0.2, "in": 0.7, "cm": 1.0}
 _RARE_MISTAKE = {"scene": 0.0, "object": 0.5}
+_DOUBTFUL = 2.5  # units that are more unusual by less may be what a user means where nothing is found
 _CLOSE = 1.0  # candidates that are not much more unusual than the best one are named, too
 
 
@@ -116,16 +117,19 @@ def length_problem(diameter: float, object_unit: str, scene: SceneSize) -> str |
 
 
 def length_doubt(diameter: float, object_unit: str, scene: SceneSize) -> str | None:
-    """Tell in a clause which other unit of the scene would be more usual, None if none would.
+    """Tell in a clause which other units of the scene would be about as usual, None if none would.
 
     It is for scenes in which nothing was found: their lengths can be right, but need not be.
     """
-    scenes = [replace(scene, unit=unit) for unit in (scene.unit, *METRES)]
+    most = _oddity(diameter, object_unit, scene) + _DOUBTFUL
+    scenes = [replace(scene, unit=unit) for unit in METRES if unit != scene.unit]
     possible = [other for other in scenes if _fault(diameter, object_unit, other) is None]
-    likeliest = min(possible, key=lambda other: _oddity(diameter, object_unit, other), default=scene).unit
-    if likeliest == scene.unit:
+    ranked = sorted((_oddity(diameter, object_unit, other), other.unit) for other in possible)
+    units = [unit for oddity, unit in ranked if oddity <= most]
+    if not units:
         return None
-    return f"if the scan's lengths are {_NAMES[likeliest]}, not {_NAMES[scene.unit]}, say --units {likeliest}"
+    names = " or ".join(_NAMES[unit] for unit in units)
+    return f"if the scan's lengths are {names}, not {_NAMES[scene.unit]}, say --units {' or '.join(units)}"
 
 
 def _fault(diameter: float, object_unit: str, scene: SceneSize) -> str | None:

@@ -17,6 +17,7 @@ from kmn_jax.geometry import Camera, measured_points
 from kmn_jax.io._exr import parse_exr
 from kmn_jax.io._images import image_header, read_image
 from kmn_jax.io._meshes import CLOUD_SUFFIXES, parse_mesh, read_file
+from kmn_jax.io._origin import held
 from kmn_jax.limits import check_bytes, check_elements, most_elements, parse_json
 from kmn_jax.units import METRES, check_unit
 
@@ -32,10 +33,11 @@ _DENSEST = 4096  # bytes of pixels from one byte of a file: compression that doe
 class Scan:
     """What a sensor at the origin measured, in its frame (x right, y down, z forward for depth images).
 
-    `points` are finite and not the origin. Normals are those of the file, unit, or none.
+    `points` are finite and not the origin; float64 if they lie too far from it for float32, see `held`. Normals are
+    those of the file, unit, or none.
     """
 
-    points: Float32[np.ndarray, "n 3"]
+    points: Float[np.ndarray, "n 3"]
     normals: Float32[np.ndarray, "n 3"] | None
     depth: Float32[np.ndarray, "h w"] | None  # zero where nothing was measured
     camera: Camera | None
@@ -43,7 +45,7 @@ class Scan:
 
     def in_unit(self, unit: str) -> Scan:
         """Return the same scan with its lengths in another unit."""
-        factor = np.float32(METRES[self.unit] / METRES[check_unit(unit)])
+        factor = METRES[self.unit] / METRES[check_unit(unit)]
         depth = None if self.depth is None else self.depth * factor
         return Scan(self.points * factor, self.normals, depth, self.camera, unit)
 
@@ -225,12 +227,12 @@ def _cloud(points: np.ndarray, normals: np.ndarray | None, unit: str) -> Scan:
     check_elements(len(rows))
     if normals is not None and normals.reshape(-1, 3).shape != rows.shape:
         raise InputError(f"its normals have shape {normals.shape}, but its points {points.shape}")
-    with np.errstate(over="ignore", invalid="ignore"):
-        rows = rows.astype(np.float32)
-        real = (np.abs(rows) < _FARTHEST).all(axis=1) & (rows != 0).any(axis=1)
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        single = rows.astype(np.float32)
+        real = (np.abs(single) < _FARTHEST).all(axis=1) & (single != 0).any(axis=1)
     if not real.any():
         raise InputError(f"none of its {len(rows)} points was measured: all are NaN, infinite, far beyond or zero")
-    return Scan(rows[real], None if normals is None else _unit(normals.reshape(-1, 3)[real]), None, None, unit)
+    return Scan(held(rows[real]), None if normals is None else _unit(normals.reshape(-1, 3)[real]), None, None, unit)
 
 
 def _unit(normals: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"] | None:

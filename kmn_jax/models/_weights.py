@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 
 from kmn_jax.errors import InputError
-from kmn_jax.files import read_safetensors, write_whole
+from kmn_jax.files import read_safetensors, safetensors_bytes, write_whole
 from kmn_jax.limits import parse_json
 from kmn_jax.models._config import KeyMatchNetConfig
 from kmn_jax.models._keymatchnet import Model, model_structure
@@ -27,7 +26,7 @@ def save_model(model: tuple[nnx.GraphDef, nnx.State], path: str | Path) -> None:
         ".".join(map(str, path)): np.ascontiguousarray(value[...]) for path, value in nnx.to_flat_state(model[1])
     }
     config = json.dumps(dataclasses.asdict(Model(*model).config))
-    write_whole(path, save(tensors, metadata={_CONFIG_KEY: config}))
+    write_whole(path, safetensors_bytes(tensors, {_CONFIG_KEY: config}))
 
 
 def is_model_file(path: str | Path) -> bool:

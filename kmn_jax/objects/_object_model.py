@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import DTypeLike
 
 from kmn_jax.errors import InputError
-from kmn_jax.io import check_triangles, read_mesh
+from kmn_jax.io import check_triangles, far_origin, object_origin, read_mesh
 from kmn_jax.objects._surface import OuterSurface, RayScene, outer_surface
 from kmn_jax.objects._symmetry import Distance, Symmetries, find_symmetries
 from kmn_jax.units import METRES, check_unit
@@ -40,6 +41,7 @@ class ObjectConfig:
 class ObjectModel:
     """A rigid object, in the frame of its file. All lengths are in `unit`.
 
+    `points` are float32, or float64 if the object lies too far from the origin of its frame: see `origin`.
     `vertices` and `triangles` are the outer surface, wound outwards; an object given as a cloud has no triangles.
     `points` are spread evenly over it, with outward unit `normals`, in farthest-point order: any first part of them
     covers the object evenly, and the first K are its keypoints.
@@ -65,6 +67,24 @@ class ObjectModel:
         return self.maximum - self.minimum
 
     @property
+    def origin(self) -> Float[np.ndarray, "3"]:
+        """The middle of the object if it lies too far from its frame's origin for float32, else zero."""
+        return far_origin(self.minimum, self.maximum)
+
+    def centred(self) -> ObjectModel:
+        """Return the same object in a frame with its `origin`."""
+        return self if not self.origin.any() else _moved(self, -self.origin, np.float32)
+
+    def near(self) -> ObjectModel:
+        """Return the object itself, or raise InputError if it lies too far from its frame's origin for float32."""
+        if self.origin.any():
+            raise InputError(
+                f"{self.name} lies {np.abs(self.origin).max():.3g} {self.unit} from the origin of its frame, too far"
+                " for float32: move it there"
+            )
+        return self
+
+    @property
     def diagonal(self) -> float:
         """The diagonal of that box: the object's size as published results take it."""
         return float(np.linalg.norm(self.extents))
@@ -76,7 +96,7 @@ class ObjectModel:
             self,
             unit=unit,
             vertices=self.vertices * factor,
-            points=(self.points * factor).astype(np.float32),
+            points=(self.points * factor).astype(self.points.dtype),
             minimum=self.minimum * factor,
             maximum=self.maximum * factor,
             diameter=self.diameter * factor,
@@ -113,6 +133,10 @@ def object_from_mesh(
     """Make an object model of a mesh, watertight or not. Raises InputError if it has no surface to see, or is flat."""
     config = config or ObjectConfig()
     check_triangles(vertices, triangles)
+    digest = digest or _digest(vertices, triangles)
+    origin = object_origin(vertices[triangles.reshape(-1)] if len(triangles) else vertices)
+    if origin.any():
+        return _moved(object_from_mesh(name, vertices - origin, triangles, unit, config, digest), origin, np.float64)
     outer = outer_surface(vertices, triangles, config.num_points, config.random_seed)
     _refuse_flat(outer.vertices)
     corners = outer.vertices[outer.triangles]
@@ -123,7 +147,7 @@ def object_from_mesh(
     sums = offsets.sum(axis=1)
     moments = np.einsum("t,tci,tcj->ij", area, offsets, offsets) + np.einsum("t,ti,tj->ij", area, sums, sums)
     shape = (center, moments / (12 * area.sum()), RayScene(outer.vertices, outer.triangles).distance)
-    return _model(name, unit, outer, shape, config.symmetry_tolerance, digest or _digest(vertices, triangles))
+    return _model(name, unit, outer, shape, config.symmetry_tolerance, digest)
 
 
 def object_from_cloud(
@@ -145,6 +169,9 @@ def object_from_cloud(
 
     config = config or ObjectConfig()
     check_triangles(points, np.zeros((0, 3), np.int32))
+    digest, origin = digest or _digest(points), object_origin(points)
+    if origin.any():
+        return _moved(object_from_cloud(name, points - origin, normals, unit, config, digest), origin, np.float64)
     distinct = np.sort(np.unique(points, axis=0, return_index=True)[1])
     if len(distinct) < config.num_points:
         raise InputError(
@@ -183,7 +210,7 @@ def object_from_cloud(
     )
     tolerance = min(config.symmetry_tolerance + spacing / size, 0.2)
     shape = (center, np.cov(kept.T, bias=True), lambda moved: tree.query(moved)[0])
-    return _model(name, unit, outer, shape, tolerance, digest or _digest(points))
+    return _model(name, unit, outer, shape, tolerance, digest)
 
 
 def _model(
@@ -224,6 +251,17 @@ def _model(
         hidden_share=outer.hidden_share,
         symmetries=find_symmetries(probes, center, moments, distance, diameter, tolerance),
         digest=digest,
+    )
+
+
+def _moved(model: ObjectModel, offset: Float[np.ndarray, "3"], dtype: DTypeLike) -> ObjectModel:
+    return replace(
+        model,
+        vertices=model.vertices + offset,
+        points=(model.points + offset).astype(dtype),
+        minimum=model.minimum + offset,
+        maximum=model.maximum + offset,
+        symmetries=replace(model.symmetries, center=model.symmetries.center + offset),
     )
 
 

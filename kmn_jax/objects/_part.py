@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
-from safetensors.numpy import save
 
 from kmn_jax.errors import InputError
-from kmn_jax.files import read_safetensors, write_whole
+from kmn_jax.files import read_safetensors, safetensors_bytes, write_whole
+from kmn_jax.io import far_origin
 from kmn_jax.limits import parse_json
 from kmn_jax.models import Model, encode_object
 from kmn_jax.objects._object_model import ObjectModel
@@ -33,7 +33,8 @@ class Part:
     """An object to look for. Lengths are in `unit`, in the object's own frame.
 
     Points are in farthest-point order: any first part of them covers the surface evenly, and the first K, as many as
-    there are rows of `features`, are the keypoints.
+    there are rows of `features`, are the keypoints. They are float32, or float64 if the object lies too far from the
+    origin of its frame: see `origin`.
     """
 
     name: str
@@ -59,6 +60,24 @@ class Part:
         """Whether another pose than the given one looks the same."""
         return len(self.symmetries.rotations) > 1 or len(self.symmetries.axes) > 0
 
+    @property
+    def origin(self) -> Float[np.ndarray, "3"]:
+        """The middle of the object if it lies too far from its frame's origin for float32, else zero."""
+        return far_origin(self.minimum, self.maximum)
+
+    def centred(self) -> Part:
+        """Return the same part in a frame with its `origin`, which float32 holds."""
+        origin = self.origin
+        if not origin.any():
+            return self
+        return replace(
+            self,
+            points=(self.points - origin).astype(np.float32),
+            minimum=self.minimum - origin,
+            maximum=self.maximum - origin,
+            symmetries=replace(self.symmetries, center=self.symmetries.center - origin),
+        )
+
     def in_unit(self, unit: str) -> Part:
         """Return the same part with its lengths in another unit; the features do not depend on it."""
         factor = METRES[self.unit] / METRES[check_unit(unit)]
@@ -67,7 +86,7 @@ class Part:
         return replace(
             self,
             unit=unit,
-            points=(self.points * factor).astype(np.float32),
+            points=(self.points * factor).astype(self.points.dtype),
             diameter=self.diameter * factor,
             minimum=self.minimum * factor,
             maximum=self.maximum * factor,
@@ -105,13 +124,13 @@ def make_part(found: ObjectModel, model: Model, digest: str | None = None) -> Pa
     count = config.num_object_points
     if len(found.points) < count:
         raise InputError(f"{found.name} has {len(found.points)} points, but this network takes {count}: make more")
-    cloud = np.concatenate([found.points, found.normals], axis=1)[:count].astype(np.float32)
+    cloud = np.concatenate([found.centred().points, found.normals], axis=1)[:count].astype(np.float32)
     keypoints = np.arange(config.num_keypoints)
     features = encode_object(model, cloud, keypoints, np.float32(found.diameter)).features
     return Part(
         name=found.name,
         unit=found.unit,
-        points=found.points.astype(np.float32),
+        points=found.points,
         normals=found.normals.astype(np.float32),
         features=np.asarray(jax.device_get(features), dtype=np.float32),
         diameter=float(found.diameter),
@@ -125,7 +144,9 @@ def make_part(found: ObjectModel, model: Model, digest: str | None = None) -> Pa
 
 
 def arrays_of(model: Model, part: Part) -> PartArrays:
-    """Return what a search needs of a part."""
+    """Return what a search needs of a part. Raises InputError if it must be `centred` first."""
+    if part.origin.any():
+        raise InputError(f"{part.name} lies too far from the origin of its frame for float32: take part.centred()")
     count = model.config.num_object_points
     points, normals = jnp.asarray(part.points[:count]), jnp.asarray(part.normals[:count])
     return PartArrays(points, normals, jnp.asarray(part.features), jnp.float32(part.diameter))
@@ -152,10 +173,7 @@ def save_part(part: Part, path: str | Path) -> None:
         "source_digest": part.source_digest,
         "model_digest": part.model_digest,
     }
-    content = save(
-        {name: np.ascontiguousarray(array) for name, array in tensors.items()},
-        metadata={"format": _FORMAT, "facts": json.dumps(facts)},
-    )
+    content = safetensors_bytes(tensors, {"format": _FORMAT, "facts": json.dumps(facts)})
     if len(content) > _LIMIT:
         raise InputError(
             f"the card of {part.name} would have {len(content)} bytes, more than {_LIMIT}: take fewer points"
@@ -200,7 +218,8 @@ def _part(tensors: dict[str, np.ndarray], facts: dict[str, object]) -> Part:
             raise ValueError(f"{name} = {value}")
         return value
 
-    points = array("points", None, 3).astype(np.float32)
+    points = array("points", None, 3)
+    points = points.astype(np.float64 if points.dtype == np.float64 else np.float32)
     features = array("features", None, None).astype(np.float32)
     if not 1 <= len(features) <= len(points):
         raise ValueError(f"{len(features)} keypoints of {len(points)} points")

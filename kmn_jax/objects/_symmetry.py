@@ -10,6 +10,7 @@ rotation groups (cyclic, dihedral, tetrahedral, octahedral, icosahedral), all of
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import combinations
@@ -25,6 +26,10 @@ _Spin = tuple[np.ndarray, int]  # an axis and its order
 _MAX_ORDER = 36
 _PRIMES = (2, 3, 5, 7, 11, 13)  # every order tried is a multiple of one of these
 _COARSE_POINTS = 256
+_FIRST_POINTS = 16  # by which most rotations fail
+_NEARLY = 24  # axes that are looked at closely
+_MOST_DISTANCES = 4_000_000  # from the surface, after which no more axes are tried: several times what parts take
+_LOG = logging.getLogger(__name__)
 _SAME_AXIS = np.cos(np.radians(6))
 # Angles between neighbouring axes of order 5 in the icosahedral group, 4 in the octahedral, 3 in the tetrahedral one.
 _POLYHEDRAL = ((5, np.arctan(2)), (4, np.pi / 2), (3, np.arccos(1 / 3)))
@@ -76,7 +81,9 @@ def find_symmetries(
     axes = np.concatenate([vectors.T, _sphere_directions(1500)]) if isotropic else vectors.T
     spins: list[_Spin] = []
     for prime in (5, 3, 2) if isotropic else _PRIMES:
-        for start in search.nearly(axes, prime):
+        for start in search.nearly(axes, prime) if not search.is_spent else ():
+            if search.is_spent:
+                break
             if any(abs(start @ axis) > _SAME_AXIS and order % prime == 0 for axis, order in spins):
                 continue
             axis = search.refined(start, prime)
@@ -90,7 +97,14 @@ def find_symmetries(
                 spins.append((axis, order))
     if not isotropic:
         spins += [(vectors[:, index], 1) for index in range(3) if equal[index]]
-    return Symmetries(search.largest_group(spins), np.zeros((0, 3)), center, tolerance)
+    group = search.largest_group(spins)
+    if search.is_spent:
+        _LOG.warning(
+            "the search for symmetries ended after %d million distances, and may have missed some: the object looks"
+            " nearly the same from many sides, as a damaged mesh does",
+            _MOST_DISTANCES // 1_000_000,
+        )
+    return Symmetries(group, np.zeros((0, 3)), center, tolerance)
 
 
 def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
@@ -104,20 +118,35 @@ class _Search:
     def __init__(
         self, points: Float[np.ndarray, "n 3"], center: Float[np.ndarray, "3"], distance: Distance, bound: float
     ) -> None:
-        self.points, self.center, self.distance, self.bound = points - center, center, distance, bound
+        self.center, self.distance, self.bound = center, distance, bound
         # The outermost points tell most rotations apart, whatever their number.
-        order = np.argsort(-np.linalg.norm(self.points, axis=1), kind="stable")
-        self.coarse = self.points[np.concatenate([order[:_COARSE_POINTS], order[:: max(1, len(order) // 256)]])]
+        order = np.argsort(-np.linalg.norm(points - center, axis=1), kind="stable")
+        self.points = (points - center)[order]
+        self.coarse = np.concatenate([self.points[:_COARSE_POINTS], self.points[:: max(1, len(order) // 256)]])
+        self.spent = 0  # distances
+
+    @property
+    def is_spent(self) -> bool:
+        """Whether no more axes are tried."""
+        return self.spent > _MOST_DISTANCES
 
     def deviations(
-        self, rotations: Float[np.ndarray, "r 3 3"], points: Float[np.ndarray, "n 3"]
+        self, rotations: Float[np.ndarray, "r 3 3"], points: Float[np.ndarray, "n 3"], most: float = np.inf
     ) -> Float[np.ndarray, " r"]:
-        turned = points @ rotations.transpose(0, 2, 1) + self.center
-        return self.distance(turned.reshape(-1, 3)).reshape(len(rotations), -1).max(axis=1)
+        """Return how far each rotation moves points from the surface; of more than `most`, only that it is more."""
+        result, start, step = np.zeros(len(rotations)), 0, _FIRST_POINTS
+        while start < len(points) and (result <= most).any():
+            left = np.flatnonzero(result <= most)
+            turned = points[start : start + step] @ rotations[left].transpose(0, 2, 1) + self.center
+            self.spent += turned.size // 3
+            found = self.distance(turned.reshape(-1, 3)).reshape(len(left), turned.shape[1])
+            result[left] = np.maximum(result[left], found.max(axis=1, initial=0))
+            start, step = start + step, 4 * step
+        return result
 
     def all_hold(self, rotations: Iterable[Float[np.ndarray, "3 3"]]) -> bool:
         return all(
-            self.deviations(rotation[None], points)[0] <= self.bound
+            self.deviations(rotation[None], points, self.bound)[0] <= self.bound
             for rotation in rotations
             for points in (self.coarse, self.points)
         )
@@ -140,7 +169,7 @@ class _Search:
             if limit is None:
                 some = np.stack([rotation_about(axis, angle) for angle in np.radians(np.arange(5, 181, 5))])
                 limit = 0.6 * float(self.deviations(some, self.coarse).max())
-            if self.deviations(group, self.coarse).max() <= limit:
+            if self.deviations(group, self.coarse, limit).max() <= limit:
                 return order
         return 1
 
@@ -153,27 +182,41 @@ class _Search:
         return Symmetries(np.stack([np.eye(3), *turned_over]), axis[None], self.center, tolerance)
 
     def nearly(self, axes: Float[np.ndarray, "a 3"], order: int) -> Float[np.ndarray, "b 3"]:
-        """Return the axes whose rotation of this order comes near to a symmetry, the 24 nearest at most, in order.
+        """Return the axes whose rotation of this order comes near to a symmetry, the nearest ones, in order.
 
         Near is three times the tolerance: a grid of directions misses an axis by about two degrees, which moves the
         outermost points by 3% of the size.
         """
-        for points in (self.coarse[:: len(self.coarse) // 32], self.coarse):
-            if len(axes):
-                deviations = self.deviations(np.stack([_turn(axis, order) for axis in axes]), points)
-                axes = axes[np.argsort(deviations, kind="stable")[: (deviations <= 3 * self.bound).sum()]]
-        return axes[:24]
+        most = 3 * self.bound
+        turns = np.stack([_turn(axis, order) for axis in axes])
+        few = self.deviations(turns, self.coarse[:: len(self.coarse) // 32], most)
+        ranked = np.argsort(few, kind="stable")[: (few <= most).sum()]
+        # The best of the few points first: what deviates by more than the 24th so far need not be known exactly.
+        kept = np.zeros(0, dtype=np.int64)
+        deviations = np.zeros(0)
+        for start in range(0, len(ranked), 2 * _NEARLY):
+            some = ranked[start : start + 2 * _NEARLY]
+            kept = np.concatenate([kept, some])
+            deviations = np.concatenate([deviations, self.deviations(turns[some], self.coarse, most)])
+            best = np.argsort(deviations, kind="stable")[: min(_NEARLY, int((deviations <= most).sum()))]
+            kept, deviations = kept[best], deviations[best]
+            if len(best) == _NEARLY:
+                most = float(deviations[-1])
+        return axes[kept]
 
     def refined(
         self, axis: Float[np.ndarray, "3"], order: int, about: Float[np.ndarray, "3"] | None = None
     ) -> Float[np.ndarray, "3"]:
         """Turn an axis, in any way or only about another one, to where its rotation fits best, by halving steps."""
-        best, step = self.deviations(_turn(axis, order)[None], self.coarse)[0], np.radians(1.5)
+        distances = self.distance(self.coarse @ _turn(axis, order).T + self.center)
+        points = self.coarse[np.argsort(-distances)]  # those that fit worst tell most of what is near, too
+        best, step = float(distances.max()), np.radians(1.5)
+        self.spent += len(points)
         while step > np.radians(0.02):
             sides = _across(axis) if about is None else (np.cross(about, axis),)
             trials = [axis + step * way for side in sides for way in (side, -side)]
             trials = [trial / np.linalg.norm(trial) for trial in trials]
-            scores = self.deviations(np.stack([_turn(trial, order) for trial in trials]), self.coarse)
+            scores = self.deviations(np.stack([_turn(trial, order) for trial in trials]), points, best)
             if scores.min() < best:
                 best, axis = float(scores.min()), trials[int(scores.argmin())]
             else:
@@ -193,6 +236,9 @@ class _Search:
         best = np.eye(3)[None]
         for axis, order in sorted(spins, key=lambda spin: -spin[1]):
             if 2 * order <= len(best):
+                break
+            if self.is_spent:
+                best = _cyclic(axis, order) if order > len(best) else best
                 break
             if order > len(best):
                 best = _cyclic(axis, order)

@@ -77,6 +77,7 @@ class Checkpoints:
         return None if packed is None else unpack(packed, like)
 
     def _newest(self, like: TrainState, best: bool) -> Packed | None:
+        undecoded: dict[str, str] = {}  # what was read as it was written, by name
         for path in [] if best else self._leftovers():
             self._report(f"{path} was not finished and is not used")
         for entry in self._entries():
@@ -86,14 +87,25 @@ class Checkpoints:
                 record = _checked_record(entry.path)
             except Exception as error:  # whatever damage leads to
                 self._damaged.add(entry.path.name)
-                reason = str(error).strip().partition("\n")[0][:300] or type(error).__name__
-                self._report(f"{entry.path} is damaged and is not used: {reason}")
+                self._report(f"{entry.path} is damaged and is not used: {_reason(error)}")
                 continue
             try:
                 check_fit(record, like)
             except InputError as error:
                 raise InputError(f"{entry.path}: {error}") from None
-            return Packed(_read_arrays(entry.path, record["layout"]), record)
+            try:
+                arrays = _read_arrays(entry.path, record["layout"])
+            except ImportError:
+                raise
+            except Exception as error:  # orbax has no error of its own
+                undecoded[entry.path.name] = _reason(error)
+                self._report(f"{entry.path} cannot be decoded and is not used: {_reason(error)}")
+                continue
+            self._damaged |= undecoded.keys()
+            return Packed(arrays, record)
+        if undecoded:  # none of them: then it is not they that are at fault
+            name, reason = next(iter(undecoded.items()))
+            raise InputError(f"{self.folder / name} is as it was written, but cannot be decoded: {reason}")
         return None
 
     def _write(self, packed: Packed, best: bool) -> None:
@@ -156,6 +168,10 @@ class _Entry:
     edition: int  # counts the saves of this step
     best: bool
     path: Path
+
+
+def _reason(error: Exception) -> str:
+    return str(error).strip().partition("\n")[0][:300] or type(error).__name__
 
 
 def _save(path: Path, packed: Packed) -> None:

@@ -53,8 +53,8 @@ def truth_codes(part: Part, detection: Detection, truth: Sequence[Float[np.ndarr
 
 def nearest_keypoint(part: Part, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     """Return the keypoint that is nearest to each point of the object's frame."""
-    keypoints = part.points[: part.num_keypoints].astype(np.float64)
-    return ((keypoints**2).sum(axis=1) - 2 * points @ keypoints.T).argmin(axis=1)
+    keypoints = part.points[: part.num_keypoints].astype(np.float64) - part.origin
+    return ((keypoints**2).sum(axis=1) - 2 * (points - part.origin) @ keypoints.T).argmin(axis=1)
 
 
 def surface_distances(part: Part, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from kmn_jax.detection import Detection, Detections, Scene
 from kmn_jax.errors import InputError
 from kmn_jax.objects import Part
+from kmn_jax.units import place_text
 from kmn_jax.viz._legend import LIKELY, summary
 from kmn_jax.viz._shading import as_bytes, distinct_colors
 from kmn_jax.viz._viewer_scene import PageScene, PoseNodes
@@ -207,7 +208,7 @@ class Viewer:
                 return
             self._server.scene.remove_click_callback(self._clicked)
             self._scene.show_mark(point)
-            place = ", ".join(f"{value:.4g}" for value in point)
+            place = ", ".join(place_text(point, self.found.unit))
             self._set_picking("searching", f"Searching around ({place}) {self.found.unit} ...")
         try:
             self.show(self._on_pick(point))
@@ -237,7 +238,7 @@ def _facts(pose: Detection, color: Float[np.ndarray, "3"]) -> str:
 
 
 def _details(pose: Detection, unit: str) -> str:
-    place = ", ".join(f"{value:.4g}" for value in pose.T_scene_object[:3, 3])
+    place = ", ".join(place_text(pose.T_scene_object[:3, 3], unit))
     return (
         f"at ({place}) {unit}; explained {pose.explained:.0%}, violated {pose.violated:.0%}, occluded"
         f" {pose.occluded:.0%}, unknown {pose.unknown:.0%}; runner-up gap {pose.runner_up_gap:.2f}"

@@ -51,7 +51,8 @@ class PageScene:
         from matplotlib import colormaps
         from matplotlib.colors import Normalize
 
-        self._scene, self._view, self._part = server.scene, view, part
+        self._scene, self._view, self._part = server.scene, view, part.centred()
+        self._origin = part.origin
         self._T_view_scene = np.linalg.inv(view.T_scene_camera)
         low, high = np.percentile(view.points, [1, 99], axis=0).astype(np.float64)
         self._center = (low + high) / 2
@@ -91,6 +92,7 @@ class PageScene:
 
         scene, part, name = self._scene, self._part, f"/poses/{rank}"
         T = self._T_view_scene @ pose.T_scene_object
+        T[:3, 3] += T[:3, :3] @ self._origin
         frame = scene.add_frame(
             name,
             show_axes=False,

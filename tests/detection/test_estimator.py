@@ -25,7 +25,7 @@ from kmn_jax.detection import (
     table,
 )
 from kmn_jax.errors import InputError
-from kmn_jax.io import Scan
+from kmn_jax.io import Scan, read_mesh
 from kmn_jax.objects import Part, save_part
 from kmn_jax.pose import adi, mssd
 from tests.reference.meshes import Mesh, box, random_rotations
@@ -212,6 +212,41 @@ def test_a_scan_without_the_part_is_an_empty_or_doubtful_result(estimator: PoseE
     reason = strict.detect(motor, scene, at=wavy[:2]).reason
     assert reason is not None
     assert reason.endswith("; say --units cm")
+
+
+def test_parts_and_scans_may_lie_far_from_the_origin(estimator: PoseEstimator, motor: Part) -> None:
+    scan, truth = bin_of(0)
+    near = scan.points[np.linalg.norm(scan.points - truth[0][:3, 3], axis=1) < motor.diameter].astype(np.float64)
+    mesh = read_mesh(MOTOR)
+    offset = np.array([1e9, 0, -1e9])
+    far = estimator.prepare((mesh.vertices + offset, mesh.triangles))
+    assert far.points.dtype == np.float64
+    whole = ForegroundOptions(remove_plane="never")
+    pose = estimator.detect(far, near, unit="mm", background=whole).poses[0]
+    shown = pose.T_scene_object.copy()
+    shown[:3, 3] += shown[:3, :3] @ offset
+    assert errors(shown, truth, motor).min() < 0.1
+    # A scan of a map: seen from a place that is given in its frame, and so is all that comes back.
+    place = np.array([5e5, 5.4e6, 300.0])
+    points = near / 1000 + place
+    roi = tuple(float(x) for x in (*points.min(axis=0), *points.max(axis=0)))
+    given = ForegroundOptions(Scan(points + np.array([0, 0, 1]), None, None, None, "m"), roi)
+    found = estimator.detect(motor, points, unit="m", sensor=place, background=given)
+    best = found.poses[0].T_scene_object.copy()
+    best[:3, 3] = (best[:3, 3] - place) * 1000
+    assert errors(best, truth, motor).min() < 0.1
+    assert np.linalg.norm(points - found.poses[0].seed, axis=1).min() < 1e-6
+    assert np.abs(found.poses[0].prediction.points - place).max() < 2
+    assert found.unexplained_points is not None
+    assert np.abs(found.unexplained_points - place).max(initial=0) < 2
+    there = estimator.detect(motor, points, unit="m", sensor=place, at=found.poses[0].seed)
+    np.testing.assert_array_equal(there.poses[0].seed, found.poses[0].seed)
+    with pytest.raises(InputError, match=r"from its sensor, .* say where"):
+        estimator.detect(motor, points, unit="m")
+    for wrong in ({"sensor": place * 1e300}, {"sensor": place, "at": place * 1e300}):
+        with pytest.raises(InputError, match="beyond float32") as told:
+            estimator.detect(motor, points, unit="m", **wrong)
+        assert "\n" not in str(told.value)
 
 
 def test_an_exported_estimator_finds_the_same_without_this_package(

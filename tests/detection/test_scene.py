@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import jax
+import jax.monitoring
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from kmn_jax.detection import ForegroundOptions, OrientedBox, Scene, make_scene
+from kmn_jax.detection import ForegroundOptions, OrientedBox, Scene, make_scene, seed_keys, seeds_over
 from kmn_jax.errors import InputError
-from kmn_jax.geometry import Camera
+from kmn_jax.geometry import Camera, measured_points
 from kmn_jax.io import Scan
 from tests.reference.meshes import pose, random_rotations
+from tests.reference.parts import box_part
 
 
 def wall(count: int = 4000, seed: int = 0) -> np.ndarray:
@@ -133,3 +136,41 @@ def test_a_region_may_be_turned() -> None:
 def test_a_scene_without_foreground_is_refused() -> None:
     with pytest.raises(InputError, match="no point of the scan is left as foreground"):
         make_scene(cloud(wall()), 0.5, inside=np.zeros(4000, dtype=bool))
+
+
+def test_scenes_of_other_sizes_compile_nothing() -> None:
+    compiled: list[str] = []
+
+    def listen(event: str, duration_secs: float, **_: str | int) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(event)
+
+    def prepared(count: int, height: int, seeds: int) -> tuple[tuple[int, ...], ...]:
+        scene = seen(cloud(wall(count)))
+        rows = seeds_over(scene, scene.foreground, box_part(), seeds)
+        assert len(rows) == seeds
+        assert seed_keys(rows, 0).shape == (seeds, 2)
+        image = depth_image(height)
+        return scene.cloud.points.shape, scene.image.depth.shape, image.image.depth.shape
+
+    def depth_image(height: int) -> Scene:
+        camera = Camera(10.0, 10.0, 2.0, 2.0, 50, height)
+        depth = np.full((height, 50), 2.0, dtype=np.float32)
+        return seen(Scan(measured_points(depth, camera), None, depth, camera, "m"))
+
+    first = prepared(4000, 40, 3)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    assert prepared(9000, 300, 5) == prepared(70, 1000, 2) == first
+    assert compiled == []
+    jax.jit(lambda x: x + 1)(np.float32(1))
+    assert len(compiled) == 1
+
+
+def test_large_scans_keep_the_capacity_and_the_asked_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("kmn_jax.detection._scene.MOST_POINTS", 1024)
+    points = wall(4000)
+    places = points[[5, 2000, 3999]].astype(np.float64)
+    scene = make_scene(cloud(points), 0.5, inside=np.ones(4000, dtype=bool), keep=places)
+    assert scene.cloud.points.shape == (1024, 3)
+    assert all((scene.points == place.astype(np.float32)).all(axis=1).any() for place in places)
+    assert reached(scene) > 0.97

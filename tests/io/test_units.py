@@ -79,7 +79,16 @@ def test_a_more_usual_unit_is_told_where_nothing_is_found() -> None:
     assert length_doubt(60.0, "mm", scene(MOTOR, "mm")) is None
     tenth = scene(MOTOR, "cm", "mm")
     assert length_problem(60.0, "mm", tenth) is None
-    assert length_doubt(60.0, "mm", tenth) == "if the scan's lengths are inches, not millimetres, say --units in"
+    told = "if the scan's lengths are inches or centimetres, not millimetres, say --units in or cm"
+    assert length_doubt(60.0, "mm", tenth) == told
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_centimetres_read_as_millimetres_are_told(name: str) -> None:
+    shown = scene(RIGHT[name], "cm", "mm")
+    told = length_problem(RIGHT[name][0], "mm", shown) or length_doubt(RIGHT[name][0], "mm", shown)
+    assert told is not None
+    assert "centimetres" in told
 
 
 @pytest.mark.parametrize(

@@ -207,3 +207,43 @@ def test_size_changes_nothing(scale):
 def test_tolerances_outside_of_the_range(tolerance):
     with pytest.raises(InputError, match=r"above 0 and at most 0\.2"):
         Posed(CYLINDER).symmetries(tolerance)
+
+
+def counted(distance):
+    """Return a distance, and the list of how many points it was asked for."""
+    asked = []
+
+    def count(points):
+        asked.append(len(points))
+        return distance(points)
+
+    return count, asked
+
+
+def cube_distance(points):
+    outside = np.abs(points) - 0.5
+    return np.abs(np.linalg.norm(np.maximum(outside, 0), axis=1) + np.minimum(outside.max(axis=1), 0))
+
+
+def test_most_rotations_are_refused_by_few_points():
+    points = surface_points(block((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), 800)[0]
+    distance, asked = counted(cube_distance)
+    found = find_symmetries(points, np.zeros(3), np.eye(3), distance, 3**0.5)
+    assert len(found.rotations) == 24
+    print(f"{sum(asked)} distances")
+    assert sum(asked) < 1_000_000
+
+
+def test_a_search_without_an_end_is_ended_and_told(monkeypatch, caplog):
+    monkeypatch.setattr("kmn_jax.objects._symmetry._MOST_DISTANCES", 100_000)
+
+    def rough(points):
+        return 0.04 + 0.024 * np.sin(30 * points).prod(axis=1)
+
+    points = np.random.default_rng(0).normal(size=(800, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    distance, asked = counted(rough)
+    found = find_symmetries(points, np.zeros(3), np.eye(3), distance, 2.0)
+    assert len(found.rotations) == 1
+    assert sum(asked) < 600_000
+    assert "may have missed some" in caplog.text

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import shutil
 import signal
@@ -168,6 +170,38 @@ def test_broken_folders(two: Path, tmp_path: Path, like: TrainState, damage: Cal
     checkpoints.save(random_snapshot(15, like))
     assert checkpoints.steps == [10, 15]
     assert_same(Checkpoints(folder).latest(like), random_snapshot(15, like))
+
+
+def undecodable(path: Path) -> None:
+    """Break a checkpoint's arrays, with the digests of what is then there."""
+    broken = files_by_kind(path)["state/manifest.ocdbt"]
+    broken.write_bytes(broken.read_bytes()[::-1])
+    content = json.loads(json.loads((path / "record.json").read_text())["content"])
+    content["files"][str(broken.relative_to(path))] = hashlib.sha256(broken.read_bytes()).hexdigest()
+    text = json.dumps(content)
+    stored = {"sha256": hashlib.sha256(text.encode()).hexdigest(), "content": text}
+    (path / "record.json").write_text(json.dumps(stored))
+
+
+def test_what_orbax_cannot_decode_gives_way_to_the_one_before(two: Path, tmp_path: Path, like: TrainState) -> None:
+    folder = shutil.copytree(two, tmp_path / "checkpoints")
+    undecodable(folder / "step-00000020")
+    reports: list[str] = []
+    checkpoints = Checkpoints(folder, report=reports.append)
+    assert_same(checkpoints.latest(like), random_snapshot(10, like))
+    assert len(reports) == 1
+    assert "step-00000020 cannot be decoded and is not used: " in reports[0]
+    checkpoints.save(random_snapshot(15, like))
+    assert checkpoints.steps == [10, 15]
+
+
+def test_if_none_can_be_decoded_all_stay(two: Path, tmp_path: Path, like: TrainState) -> None:
+    folder = shutil.copytree(two, tmp_path / "checkpoints")
+    for name in ("step-00000010", "step-00000020"):
+        undecodable(folder / name)
+    with pytest.raises(InputError, match=r"step-00000020 is as it was written, but cannot be decoded"):
+        Checkpoints(folder, report=lambda _: None).latest(like)
+    assert Checkpoints(folder).steps == [10, 20]
 
 
 def test_half_written_one(two: Path, tmp_path: Path, like: TrainState) -> None:
