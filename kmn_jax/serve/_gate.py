@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import ipaddress
 import json
 from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from typing import Any, TypeAlias
 from starlette.exceptions import HTTPException
 
 from kmn_jax.serve._settings import MEGABYTE, ServeConfig
+from kmn_jax.web import is_allowed_host, is_same_origin
 
 AsgiScope: TypeAlias = MutableMapping[str, Any]
 Receive: TypeAlias = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -23,11 +23,7 @@ _LATER = {"Retry-After": "5"}
 
 
 class Gate:
-    """Refuses requests for other hosts and from other pages, and bodies that are too large or too slow.
-
-    A page of another site can make a browser send requests here, and by a name that it lets point to this machine even
-    read the answers. The first always names its Origin; the second names a Host that is not ours.
-    """
+    """Refuses requests for other hosts and from other pages, and bodies that are too large or too slow."""
 
     def __init__(self, app: Asgi, config: ServeConfig) -> None:
         self._app, self._config = app, config
@@ -98,33 +94,6 @@ class _Body:
     end: float  # when the rest must have come
     size: int = 0
     is_whole: bool = False
-
-
-def is_allowed_host(host: str, names: tuple[str, ...]) -> bool:
-    """Tell whether a Host header names this machine: by an address, as localhost, or by one of the names.
-
-    No name of another site can point to an address that is written in digits.
-    """
-    name, port = host, ""
-    if host.startswith("["):
-        name, _, port = host[1:].partition("]")
-        port = port.removeprefix(":")
-    elif ":" in host:
-        name, _, port = host.partition(":")
-    if port and not (port.isascii() and port.isdecimal()):
-        return False
-    if name.lower() in ("localhost", *(allowed.lower() for allowed in names)):
-        return True
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
-
-
-def is_same_origin(origin: str | None, host: str) -> bool:
-    """Tell whether a request comes from a page of this server, or from no page at all."""
-    return origin is None or origin.lower() in (f"http://{host.lower()}", f"https://{host.lower()}")
 
 
 async def _answer(send: Send, status: int, sentence: str) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import signal
-import socket
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
@@ -19,8 +18,9 @@ from kmn_jax.errors import InputError
 from kmn_jax.io import MESH_SUFFIXES, Scan
 from kmn_jax.objects import Part
 from kmn_jax.serve._parts import PartStore, check_name
-from kmn_jax.serve._settings import ServeConfig, why
+from kmn_jax.serve._settings import ServeConfig
 from kmn_jax.serve._warm_up import PLACE, bracket, brackets_on_a_floor
+from kmn_jax.web import address, listen
 
 _PART_SUFFIXES = (*MESH_SUFFIXES, ".pcd", ".xyz", ".kmn")
 _AFTER_LIMITS = 10.0  # s that answers are waited for once all limits have passed
@@ -45,7 +45,7 @@ def serve(
     from kmn_jax.serve._app import make_app
     from kmn_jax.serve._searches import Searches
 
-    listening = _listen(config)
+    listening = listen(config.host, config.port)
     with contextlib.closing(listening), _private_folder() as folder:
         estimator = PoseEstimator.from_pretrained(weights)
         named = {} if parts is None else _prepared(estimator, parts)
@@ -69,7 +69,7 @@ def serve(
         app = make_app(Searches(estimator, weights, store, folder), config, warm_up)
         server = stoppable(uvicorn.Server(uvicorn_config(app, config)))
         stopping.append(server)
-        started(address(listening))
+        started(address(config.host, listening.getsockname()[1]))
         server.run(sockets=[listening])
     if failures:
         raise failures[0]
@@ -127,27 +127,6 @@ def search_all(estimator: PoseEstimator, part: Part | None, scan: Scan | None) -
         estimator.detect(used, scene, at=place)
     with tempfile.TemporaryDirectory() as folder:
         save_picture(Path(folder, "picture.png"), scene, used, found)
-
-
-def address(listening: socket.socket) -> str:
-    """Return where a socket listens, as a browser is told it."""
-    host, port = listening.getsockname()[:2]
-    host = "127.0.0.1" if host == "0.0.0.0" else "::1" if host == "::" else host
-    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
-
-
-def _listen(config: ServeConfig) -> socket.socket:
-    try:
-        family, *_, place = socket.getaddrinfo(config.host or None, config.port, flags=socket.AI_PASSIVE)[0]
-        return socket.create_server(place[:2], family=family, backlog=1024)
-    except (socket.gaierror, UnicodeError):
-        raise InputError(
-            f"host {config.host!r} is not known: 127.0.0.1 answers this machine only, 0.0.0.0 all that reach it"
-        ) from None
-    except OSError as error:
-        raise InputError(
-            f"port {config.port} of {config.host} cannot be used ({why(error)}): choose another one, or 0 for any"
-        ) from None
 
 
 def _prepared(estimator: PoseEstimator, folder: Path) -> dict[str, Part]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass
 
 from kmn_jax.errors import require
@@ -28,7 +27,6 @@ class ServeConfig:
     write_limit: float = 30.0  # in which a client has to take an answer that does not fit the connection's buffer
 
     def __post_init__(self) -> None:
-        require(0 <= self.port <= 65535, f"port {self.port} is not one: choose 1 to 65535, or 0 for any that is free")
         for name in ("most_bytes", "most_queued", "most_parts", "most_connections"):
             require(getattr(self, name) >= 1, f"{name} is {getattr(self, name)}, but must be at least 1")
         for name in ("time_limit", "head_limit", "body_limit", "write_limit"):
@@ -38,13 +36,3 @@ class ServeConfig:
             require(
                 bool(name) and not set(name) & set("/: \t"), f"host {name!r} must be a name without scheme and port"
             )
-
-
-def is_for_all(host: str) -> bool:
-    """Tell whether a server on this host answers other machines, too."""
-    return host not in ("127.0.0.1", "localhost", "::1")
-
-
-def why(error: OSError) -> str:
-    """Return the system's words for an error."""
-    return os.strerror(error.errno or 0)

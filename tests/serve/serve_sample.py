@@ -17,6 +17,7 @@ import uvicorn
 
 from kmn_jax.detection import Detections, PoseEstimator, Scene
 from kmn_jax.errors import InputError
+from kmn_jax.io import Scan
 from kmn_jax.objects import Part
 from kmn_jax.serve import ServeConfig
 from kmn_jax.serve._app import make_app
@@ -46,8 +47,8 @@ class KnownAnswer(PoseEstimator):
             raise InputError(f"{path} cannot be used: it is broken")
         return replace(PART, name=path.stem, unit=unit or "m")
 
-    def read(self, path: Path, part: Part, unit: str, camera: Path | None) -> bytes:
-        return path.read_bytes()
+    def read(self, path: Path, part: Part, unit: str, camera: Path | None) -> Scan:
+        return Scan(np.frombuffer(path.read_bytes(), np.float32).reshape(-1, 3), None, None, None, unit)
 
     def scene(self, path: Path, part: Part, **given: Any) -> Scene:
         self.asked.append({"content": path.read_bytes(), "folder": path.parent, **given})
@@ -80,7 +81,7 @@ class Running:
             connection.request(method, path, body, headers or {})
             answer = connection.getresponse()
             content = answer.read()
-            is_json = answer.headers.get_content_type() == "application/json"
+            is_json = content and answer.headers.get_content_type() == "application/json"
             return answer.status, json.loads(content) if is_json else content, answer.headers
         finally:
             connection.close()
