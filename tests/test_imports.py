@@ -13,8 +13,22 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-ROOMS = ("geometry", "models", "pose", "io", "objects", "simulate", "bop", "data", "train", "detection", "viz", "cli")
-RANKS = dict.fromkeys(("typing", "errors", "units", "files", "report"), 0) | {
+ROOMS = (
+    "geometry",
+    "models",
+    "pose",
+    "io",
+    "objects",
+    "simulate",
+    "bop",
+    "data",
+    "train",
+    "detection",
+    "viz",
+    "serve",
+    "cli",
+)
+RANKS = dict.fromkeys(("typing", "errors", "units", "files", "report", "web"), 0) | {
     name: rank for rank, name in enumerate(ROOMS, start=1)
 }
 # Pairs of neighbours that the ranks alone would allow: the pose solver takes arrays, not models.

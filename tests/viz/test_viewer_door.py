@@ -108,7 +108,7 @@ def test_a_request_that_cannot_be_understood_is_refused() -> None:
     door = Door("127.0.0.1")
     good = [("Host", "127.0.0.1:1"), ("Cookie", door.cookie.partition(";")[0])]
     assert door.refusal(Headers(good), "/") is None
-    for wrong in ([*good, ("Host", "127.0.0.1:1")], [good[0], ("Cookie", 'a="\x00;;;=')], [good[1]]):
+    for wrong in ([*good, ("Host", "127.0.0.1:1")], [good[0], ("Cookie", 'a=";;;=')], [good[1]]):
         assert door.refusal(Headers(wrong), "/")
     assert door.refusal(Headers(good[:1]), f"/?token={door.token}") is None
     assert door.refusal(Headers(good[:1]), "/?token=%00%ff")
