@@ -171,7 +171,7 @@ def serve(
     host: str = "127.0.0.1",
     port: int = 8000,
     allow_host: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
-    max_megabytes: float = 100,
+    max_megabytes: float = 100.0,
     max_queue: int = 16,
     time_limit: float = 120.0,
     weights: str = "small",

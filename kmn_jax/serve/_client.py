@@ -60,11 +60,15 @@ def detect_on_server(
     given = {name: value for name, value in fields.items() if value is not None}
     body, kind = _form({**given, "units": units, "picture": picture}, files)
     content, headers = _request(server, "/detect", body, {"Content-Type": kind})
-    result = _json(server, content)
-    said = _json(server, _request(server, headers["Part"])[0])
-    drawn = _request(server, headers["Picture"])[0] if picture else b""
-    result |= {"object": str(part), "scene": str(scene)}
-    return ServerAnswer(result, _detections(result, said["label"]), _bop_ids(scene, camera, said), drawn)
+    try:
+        result = dict(json.loads(content)) | {"object": str(part), "scene": str(scene)}
+        said = json.loads(_request(server, headers["Part"])[0])
+        drawn = _request(server, headers["Picture"])[0] if picture else b""
+        return ServerAnswer(result, _detections(result, said["label"]), _bop_ids(scene, camera, said), drawn)
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"the server at {server} does not answer as kmn serve does") from None
 
 
 def _scan_file(path: Path, camera: Path | None) -> tuple[str, bytes]:
@@ -109,7 +113,7 @@ def _form(fields: Mapping[str, Any], files: Mapping[str, tuple[str, bytes]]) -> 
 
 def _request(
     server: str, path: str, body: bytes | None = None, headers: Mapping[str, str] | None = None
-) -> tuple[bytes, Mapping[str, str]]:
+) -> tuple[bytes, http.client.HTTPMessage]:
     """Return content and headers of an answer. Redirects are followed, proxies are not used."""
     if urllib.parse.urlsplit(server).scheme not in ("http", "https"):
         raise InputError(f"{server} is no address of a server: it begins with http:// or https://")
@@ -127,13 +131,6 @@ def _request(
     except (OSError, ValueError, http.client.HTTPException) as error:
         reason = getattr(error, "reason", error)
         raise InputError(f"no answer from a server at {server} ({reason}): start one with kmn serve") from None
-
-
-def _json(server: str, content: bytes) -> dict[str, Any]:
-    try:
-        return dict(json.loads(content))
-    except (ValueError, TypeError):
-        raise InputError(f"the server at {server} does not answer as kmn serve does") from None
 
 
 def _detections(result: Mapping[str, Any], part: str) -> Detections:

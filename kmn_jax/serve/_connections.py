@@ -57,6 +57,15 @@ class BoundedConnection(H11Protocol):
         super().on_response_complete()
         self._watch()
 
+    def send_400_response(self, msg: str) -> None:
+        """Answer what is no HTTP, instead of the request that it is the rest of."""
+        if self.conn.our_state not in (h11.IDLE, h11.SEND_RESPONSE):
+            self.drop()
+            return
+        if self.cycle is not None:
+            self.cycle.disconnected = True
+        super().send_400_response(msg)
+
     def pause_writing(self) -> None:
         """Wait for the client to take what is sent."""
         super().pause_writing()

@@ -10,6 +10,9 @@ import socket
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -115,6 +118,28 @@ def test_a_port_in_use_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert re.match(rf"kmn: port {port} of 127.0.0.1 cannot be used \(.*in use\)", capsys.readouterr().err)
 
 
+@contextmanager
+def other_server() -> Iterator[str]:
+    """Serve something else."""
+
+    class Other(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            self.rfile.read(int(self.headers["Content-Length"]))
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(b"{}")
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Other) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+        thread.join()
+
+
 def test_detect_sends_all_of_a_request_to_a_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     part, scene, camera, empty = (tmp_path / name for name in ("my nut.stl", "depth.npy", "camera.json", "empty.ply"))
     part.write_bytes(b"solid")
@@ -154,5 +179,8 @@ def test_detect_sends_all_of_a_request_to_a_server(tmp_path: Path, capsys: pytes
             error = capsys.readouterr().err
             assert message in error
             assert error.count("\n") == 1
+    with other_server() as address:
+        assert main(["detect", *given, "--server", address]) == 2
+        assert f"the server at {address} does not answer as kmn serve does" in capsys.readouterr().err
     assert main(["detect", *given, "--server", url]) == 2
     assert f"no answer from a server at {url}" in capsys.readouterr().err
