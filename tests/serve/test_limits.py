@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import http.client
 import socket
@@ -10,11 +11,14 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
+from starlette.exceptions import HTTPException
 
 from kmn_jax.errors import InputError
 from kmn_jax.serve import ServeConfig
+from kmn_jax.serve._gate import Gate
 from kmn_jax.web import is_allowed_host, is_same_origin
 from tests.serve.serve_sample import Running, form, running, some_scan
 
@@ -152,6 +156,40 @@ def test_bodies_that_are_too_large_are_refused_before_they_are_read(server: Runn
     assert asking.getresponse().status == 413
     asking.close()
     assert search(server)[0] == 200
+
+
+def test_bodies_that_wait_are_bounded_together() -> None:
+    held, most = 16, 10
+
+    async def run() -> list[int | None]:
+        answered = asyncio.Event()
+
+        async def app(scope: Any, receive: Any, send: Any) -> None:
+            await receive()
+            await answered.wait()
+
+        async def receive() -> dict[str, Any]:
+            return {"type": "http.request", "body": bytes(most), "more_body": False}
+
+        async def ask() -> int | None:
+            scope = {"type": "http", "headers": [(b"host", b"localhost")]}
+            try:
+                await gate(scope, receive, receive)  # type: ignore[arg-type]  # nothing is sent
+            except HTTPException as error:
+                return error.status_code
+            return None
+
+        gate = Gate(app, ServeConfig(most_bytes=most))
+        asked = [asyncio.create_task(ask()) for _ in range(held + 1)]
+        done, _ = await asyncio.wait(asked, timeout=20, return_when=asyncio.FIRST_COMPLETED)
+        answered.set()
+        await asyncio.wait(asked)
+        return [*(one.result() for one in [*done, *asked]), await ask()]
+
+    first, *others = asyncio.run(run())
+    assert first == 503
+    assert others.count(503) == 1  # all are answered, and their places free again
+    assert others.count(None) == held + 1
 
 
 def test_slow_clients_are_given_up_and_others_answered(server: Running) -> None:
