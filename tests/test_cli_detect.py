@@ -17,6 +17,7 @@ import pytest
 from kmn_jax.bop import bop_scan
 from kmn_jax.cli import main
 from kmn_jax.detection import PoseEstimator
+from kmn_jax.serve import ServeConfig
 from tests.serve.serve_sample import running
 
 ASSETS = Path(__file__).parent.parent / "experiments" / "assets"
@@ -90,7 +91,8 @@ def test_a_server_gives_what_a_search_here_gives(card: Path, tmp_path: Path) -> 
         rows = [{**row, "time": ""} for row in table(outputs["--bop-csv"])]
         return found, rows, outputs["--save-picture"].read_bytes()
 
-    with running(tmp_path / "private", estimator=PoseEstimator.from_pretrained()) as server:
+    patient = ServeConfig(port=0, time_limit=1e4)
+    with running(tmp_path / "private", patient, PoseEstimator.from_pretrained()) as server:
         there = searched("there", "--server", f"http://127.0.0.1:{server.port}")
     here = searched("here")
     assert there[0] == here[0]

@@ -41,11 +41,12 @@ ALLOWED = {
 }
 
 # flax.nnx itself loads optax, so optax cannot be on this list.
-HEAVY = ("open3d", "trimesh", "mujoco", "grain", "viser", "torch", "orbax")
+HEAVY = ("open3d", "trimesh", "mujoco", "grain", "viser", "torch", "orbax", "fastapi", "uvicorn")
 PUBLIC = {
     "kmn_jax": [],
     "kmn_jax.pose": ["kabsch", "ransac", "icp", "add", "adi", "mssd", "PoseResult"],
     "kmn_jax.models": ["KeyMatchNet", "load_released", "encode_object", "encode_scene", "match"],
+    "kmn_jax.serve": ["detect_on_server"],  # the client needs nothing of the server
 }
 
 SUFFIXES = {".py", ".md", ".toml", ".yaml", ".yml", ".json", ".lock", ".txt", ".csv", ".sh", ".cfg", ""}
