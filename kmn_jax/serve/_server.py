@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from kmn_jax.detection import PoseEstimator
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, require
 from kmn_jax.io import MESH_SUFFIXES, Scan
 from kmn_jax.objects import Part
 from kmn_jax.serve._parts import PartStore, check_name
@@ -45,6 +45,7 @@ def serve(
     from kmn_jax.serve._app import make_app
     from kmn_jax.serve._searches import Searches
 
+    require(camera is None or example is not None, "the camera is that of an example scan: name this, too (--example)")
     listening = listen(config.host, config.port)
     with contextlib.closing(listening), _private_folder() as folder:
         estimator = PoseEstimator.from_pretrained(weights)

@@ -99,6 +99,7 @@ def test_the_command_answers_ends_when_told_and_leaves_nothing_behind(tmp_path: 
         (["--port", "0", "--parts", "no-such-folder"], "no-such-folder is not a folder"),
         (["--port", "0", "--parts", "."], "holds no part"),
         (["--port", "0", "--example", "scan.ply"], "an example scan needs the parts"),
+        (["--port", "0", "--camera", "camera.json"], "the camera is that of an example scan"),
     ],
 )
 def test_a_server_that_cannot_start_says_why(
