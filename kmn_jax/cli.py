@@ -17,14 +17,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from kmn_jax.errors import InputError
-from kmn_jax.files import check_output
+from kmn_jax.errors import InputError, number_list
+from kmn_jax.files import check_output, write_whole
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
     from kmn_jax.detection import Detections
     from kmn_jax.objects import Part
+    from kmn_jax.serve import ServerAnswer
 
 Units = Literal["auto", "mm", "cm", "m", "in"]
 
@@ -94,6 +95,7 @@ def detect(
     json: Path | None = None,
     bop_csv: Path | None = None,
     save_picture: Path | None = None,
+    server: str | None = None,
 ) -> None:
     """Find the copies of an object in a scan: poses of the whole bin, in pick order.
 
@@ -103,8 +105,9 @@ def detect(
         json: file for the result as JSON, see docs/detect.md.
         bop_csv: file for the result as BOP's csv.
         save_picture: file for a picture of scene, segmentation, keypoints and poses (PNG).
+        server: address of a kmn serve that searches instead of this process.
     """
-    from kmn_jax.detection import as_json, table, write_bop_csv, write_json
+    from kmn_jax.detection import DetectConfig, as_json, table, write_bop_csv, write_json
 
     if top is not None and top < 1:
         raise InputError(f"top is {top}, but must be at least 1")
@@ -115,21 +118,28 @@ def detect(
         from kmn_jax.viz import check_picture
 
         check_picture(save_picture)
-    session = _Session(request)
-    found = session.detect(session.places)
-    if top is not None:
-        found = replace(found, poses=found.poses[:top])
+    if server is None:
+        session = _Session(request)
+        found, bop_ids = session.detect(session.places), session.scene.bop_ids
+        if top is not None:
+            found = replace(found, poses=found.poses[:top])
+        facts = {"seed": request.random_seed, "weights": request.weights, "model": session.part.model_digest}
+        result = as_json(found, str(request.object), str(request.scene), facts)
+    else:
+        answer = _ask(request, server, top, save_picture is not None)
+        found, bop_ids, result = answer.found, answer.bop_ids, answer.result
     # Files first: whoever reads what is printed may stop reading.
     if json is not None:
-        facts = {"seed": request.random_seed, "weights": request.weights, "model": session.part.model_digest}
-        write_json(as_json(found, str(request.object), str(request.scene), facts), json)
+        write_json(result, json)
     if bop_csv is not None:
-        write_bop_csv(found, bop_csv, *session.scene.bop_ids)
-    if save_picture is not None:
+        write_bop_csv(found, bop_csv, *bop_ids)
+    if save_picture is not None and server is None:
         from kmn_jax.viz import save_picture as draw
 
         draw(save_picture, session.scene, session.part, found, session.scene.truth)
-    print(table(found, session.estimator.config.accepted))
+    elif save_picture is not None:
+        write_whole(save_picture, answer.picture)
+    print(table(found, DetectConfig().accepted))
     for target in filter(None, (json, bop_csv, save_picture)):
         print(f"wrote {target}")
 
@@ -157,6 +167,39 @@ def view(
     ) as page:
         print(f"open {page.url}; stop with Ctrl+C", flush=True)
         page.wait()
+
+
+def serve(
+    parts: Path | None = None,
+    example: Path | None = None,
+    camera: Path | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    allow_host: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    max_megabytes: float = 100.0,
+    max_queue: int = 16,
+    time_limit: float = 120.0,
+    weights: str = "small",
+) -> None:
+    """Answer searches over HTTP, as docs/serve.md tells, until the process is told to stop.
+
+    Args:
+        parts: folder of CAD files or cards that are prepared at the start and called by their names.
+        example: scan like those to come: all that they need is compiled before the server says that it is ready.
+        camera: its camera, if it is a depth image.
+        host: address to serve on; 0.0.0.0 for other machines, too.
+        port: port to serve on; 0 takes any that is free.
+        allow_host: name by which other machines may call this one; may be given several times.
+        max_megabytes: size of a request.
+        max_queue: requests that wait or run; more are told to come again.
+        time_limit: seconds until a request is given up.
+        weights: released network, or a .safetensors file.
+    """
+    from kmn_jax.serve import ServeConfig
+    from kmn_jax.serve import serve as run
+
+    limits = ServeConfig(host, port, allow_host, int(1e6 * max_megabytes), max_queue, time_limit)
+    run(limits, weights, parts, example, camera, lambda url: print(f"serving on {url}; stop with Ctrl+C", flush=True))
 
 
 def export(
@@ -207,17 +250,29 @@ def convert(
     print(f"wrote {target}")
 
 
+def _ask(request: Request, server: str, top: int | None, picture: bool) -> ServerAnswer:
+    """Return what a server finds."""
+    from kmn_jax.serve import detect_on_server
+
+    if request.weights != "small":
+        raise InputError("the server has weights of its own: leave out --weights, or start it with them")
+    files = (request.object, request.scene, request.camera, request.background)
+    names = ("at", "object_units", "random_seed", "roi", "plane", "thorough", "sensor")
+    fields = {name: getattr(request, name) for name in names}
+    return detect_on_server(server, *files, request.units, picture, top=top, **fields)
+
+
 class _Session:
     """An estimator with the part and the scan of a request."""
 
     def __init__(self, request: Request) -> None:
         from kmn_jax.detection import THOROUGH, Clock, ForegroundOptions, OrientedBox, PoseEstimator
 
-        places = [_numbers(text, "--at", 3) for text in request.at]
-        region: Any = None if request.roi is None else tuple(_numbers(request.roi, "--roi", 6, 9))
+        places = [number_list(text, "--at", 3) for text in request.at]
+        region: Any = None if request.roi is None else tuple(number_list(request.roi, "--roi", 6, 9))
         if region is not None and len(region) == 9:
             region = OrientedBox.of_numbers(region)
-        sensor = None if request.sensor is None else np.array(_numbers(request.sensor, "--sensor", 3))
+        sensor = None if request.sensor is None else np.array(number_list(request.sensor, "--sensor", 3))
         self.places = np.array(places) if places else None
         self._request, self._clock = request, Clock()
         with self._clock("part"):
@@ -249,17 +304,6 @@ class _Session:
 
 def _unit(units: Units) -> str | None:
     return None if units == "auto" else units
-
-
-def _numbers(text: str, flag: str, *counts: int) -> list[float]:
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) not in counts or not np.isfinite(values).all():
-        allowed = " or ".join(map(str, counts))
-        raise InputError(f"{flag} is {text!r}, but must be {allowed} numbers with commas between them")
-    return values
 
 
 def _size(part: Part) -> str:
@@ -294,7 +338,9 @@ def _parsed(arguments: list[str]) -> Callable[[], None]:
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            commands: dict[str, Any] = {call.__name__: later(call) for call in (prepare, detect, view, export, convert)}
+            commands: dict[str, Any] = {
+                call.__name__: later(call) for call in (prepare, detect, view, serve, export, convert)
+            }
             chosen: Callable[[], None] = tyro.extras.subcommand_cli_from_dict(commands, prog="kmn", args=arguments)
             return chosen
     except SystemExit as error:

@@ -24,6 +24,18 @@ def require(condition: bool, message: str) -> None:
         raise InputError(message)
 
 
+def number_list(text: str, name: str, *counts: int) -> list[float]:
+    """Return the finite numbers of a text with commas between them, as many as one of `counts`."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in counts or not np.isfinite(values).all():
+        allowed = " or ".join(map(str, counts))
+        raise InputError(f"{name} is {text!r}, but must be {allowed} numbers with commas between them")
+    return values
+
+
 def is_traced(value: object) -> bool:
     """Tell whether `value` is an abstract value inside jit, vmap or grad."""
     return isinstance(value, jax.core.Tracer)

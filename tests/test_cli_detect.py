@@ -16,6 +16,9 @@ import pytest
 
 from kmn_jax.bop import bop_scan
 from kmn_jax.cli import main
+from kmn_jax.detection import PoseEstimator
+from kmn_jax.serve import ServeConfig
+from tests.serve.serve_sample import running
 
 ASSETS = Path(__file__).parent.parent / "experiments" / "assets"
 IMAGE = sorted((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))[0]
@@ -73,6 +76,29 @@ def test_a_bin_in_all_forms_of_output(card: Path, tmp_path: Path, capsys: pytest
     for name, numbers in (("R", first[:3, :3]), ("t", first[:3, 3])):
         np.testing.assert_allclose(np.array(rows[0][name].split(), dtype=float), numbers.ravel(), atol=1e-6)
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_server_gives_what_a_search_here_gives(card: Path, tmp_path: Path) -> None:
+    (tmp_path / "private").mkdir()
+    flags = ["--object", str(card), "--scene", str(IMAGE), "--top", "4", "--random-seed", "1"]
+
+    def searched(name: str, *more: str) -> tuple[dict, list[dict[str, str]], bytes]:
+        outputs = {flag: tmp_path / f"{name}{flag}.png" for flag in ("--json", "--bop-csv", "--save-picture")}
+        given = [str(text) for pair in outputs.items() for text in pair]
+        assert main(["detect", *flags, *given, *more]) == 0
+        found = json.loads(outputs["--json"].read_text())
+        assert found.pop("timing")["total_s"] > 0
+        rows = [{**row, "time": ""} for row in table(outputs["--bop-csv"])]
+        return found, rows, outputs["--save-picture"].read_bytes()
+
+    patient = ServeConfig(port=0, time_limit=1e4)
+    with running(tmp_path / "private", patient, PoseEstimator.from_pretrained()) as server:
+        there = searched("there", "--server", f"http://127.0.0.1:{server.port}")
+    here = searched("here")
+    assert there[0] == here[0]
+    assert len(here[0]["poses"]) == 4
+    assert there[1] == here[1]
+    assert there[2].startswith(b"\x89PNG")
 
 
 def table(path: Path) -> list[dict[str, str]]:

@@ -13,8 +13,22 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-ROOMS = ("geometry", "models", "pose", "io", "objects", "simulate", "bop", "data", "train", "detection", "viz", "cli")
-RANKS = dict.fromkeys(("typing", "errors", "units", "files", "limits", "report"), 0) | {
+ROOMS = (
+    "geometry",
+    "models",
+    "pose",
+    "io",
+    "objects",
+    "simulate",
+    "bop",
+    "data",
+    "train",
+    "detection",
+    "viz",
+    "serve",
+    "cli",
+)
+RANKS = dict.fromkeys(("typing", "errors", "units", "files", "limits", "report", "web"), 0) | {
     name: rank for rank, name in enumerate(ROOMS, start=1)
 }
 # Pairs of neighbours that the ranks alone would allow: the pose solver takes arrays, not models.
@@ -27,11 +41,12 @@ ALLOWED = {
 }
 
 # flax.nnx itself loads optax, so optax cannot be on this list.
-HEAVY = ("open3d", "trimesh", "mujoco", "grain", "viser", "torch", "orbax")
+HEAVY = ("open3d", "trimesh", "mujoco", "grain", "viser", "torch", "orbax", "fastapi", "uvicorn")
 PUBLIC = {
     "kmn_jax": [],
     "kmn_jax.pose": ["kabsch", "ransac", "icp", "add", "adi", "mssd", "PoseResult"],
     "kmn_jax.models": ["KeyMatchNet", "load_released", "encode_object", "encode_scene", "match"],
+    "kmn_jax.serve": ["detect_on_server"],  # the client needs nothing of the server
 }
 
 SUFFIXES = {".py", ".md", ".toml", ".yaml", ".yml", ".json", ".lock", ".txt", ".csv", ".sh", ".cfg", ""}

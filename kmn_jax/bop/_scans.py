@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from kmn_jax.bop._files import millimetres, of_sensor
 from kmn_jax.bop._frames import BopInstance
@@ -14,6 +15,7 @@ from kmn_jax.errors import InputError
 from kmn_jax.io import DepthCamera, Scan, depth_scan
 
 _SUFFIXES = (".png", ".tif", ".tiff")
+_SAME_SIZE = 0.03  # between the lengths of a part and of the same one in a dataset
 
 
 def is_bop_image(path: str | Path) -> bool:
@@ -70,6 +72,23 @@ def bop_sizes(path: str | Path) -> dict[int, tuple[float, float, float, float]]:
         return {}
     models, _ = read_models(place[0].parent.parent / "models", "mm")
     return {number: (model.diameter, *np.sort(model.size).tolist()) for number, model in models.items()}
+
+
+def bop_object(
+    path: str | Path,
+    instances: tuple[BopInstance, ...] | None,
+    diameter: float,
+    extents: Float[np.ndarray, "3"],
+) -> int | None:
+    """Return which of the objects in an image a part of this diameter and extents (mm) is.
+
+    One of another size, by the dataset's models_info.json, is not the part; of several that may be, none is known to
+    be.
+    """
+    sizes, own = bop_sizes(path), (diameter, *np.sort(extents))
+    objects = {instance.object_id for instance in instances or ()}
+    alike = [number for number in objects if np.allclose(sizes.get(number, own), own, rtol=_SAME_SIZE)]
+    return alike[0] if len(alike) == 1 else None
 
 
 def _scene_of(path: Path) -> tuple[Path, str | None] | None:

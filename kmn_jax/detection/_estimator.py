@@ -10,7 +10,7 @@ from typing import Any, TypeAlias, overload
 import numpy as np
 from jaxtyping import Float
 
-from kmn_jax.bop import bop_scan, bop_scene_id, bop_sizes, is_bop_image
+from kmn_jax.bop import bop_object, bop_scan, bop_scene_id, is_bop_image
 from kmn_jax.detection._calibration import Probabilities, load_probabilities
 from kmn_jax.detection._detect import DetectConfig, detect
 from kmn_jax.detection._evidence import EVIDENCE
@@ -42,7 +42,6 @@ _UNFITTED = "the probabilities were fitted for other weights: fit them with expe
 _NUM_POINTS = 4096  # on a part's surface
 _CARD = ".kmn"
 _MOST_SEED = 2**32 - 1
-_SAME_SIZE = 0.03  # between the lengths of a part and of the same one in a dataset
 
 
 @dataclass(frozen=True)
@@ -273,15 +272,12 @@ def _read(
         if camera is not None or not is_bop_image(path):
             return read_scan(path, resolve_unit(asked, part.unit), camera), None, nothing
         scan, instances = bop_scan(path, resolve_unit(asked, part.unit, "mm"))
-        inside, sizes = part.in_unit("mm"), bop_sizes(path)
-        own = (inside.diameter, *np.sort(inside.maximum - inside.minimum))
-        # A dataset's object of another size is not the part; of several that may be, none is known to be.
-        objects = {instance.object_id for instance in instances or ()}
-        alike = [number for number in objects if np.allclose(sizes.get(number, own), own, rtol=_SAME_SIZE)]
-        ids = (bop_scene_id(path), int(path.stem), alike[0] if len(alike) == 1 else 1)
-        if len(alike) != 1:
+        inside = part.in_unit("mm")
+        alike = bop_object(path, instances, inside.diameter, inside.maximum - inside.minimum)
+        ids = (bop_scene_id(path), int(path.stem), 1 if alike is None else alike)
+        if alike is None:
             return scan, None, ids
-        copies = [instance for instance in instances or () if instance.object_id == alike[0]]
+        copies = [instance for instance in instances or () if instance.object_id == alike]
         return scan, tuple(instance.T_camera_object for instance in copies), ids
     single = np.asarray(float_array(source, "scan", (None, 3), finite=False), dtype=np.float32)
     real = np.isfinite(single).all(axis=1) & (single != 0).any(axis=1)

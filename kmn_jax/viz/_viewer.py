@@ -22,6 +22,7 @@ from kmn_jax.viz._legend import LIKELY, summary
 from kmn_jax.viz._shading import as_bytes, distinct_colors
 from kmn_jax.viz._viewer_scene import PageScene, PoseNodes
 from kmn_jax.viz._viewer_server import start_server, stop_server
+from kmn_jax.web import address
 
 _PICK, _CANCEL = "Pick a point to search at", "Cancel picking"
 _LAYERS = {  # what can be switched: whether it is shown at first, and what it is
@@ -64,7 +65,7 @@ class Viewer:
         self._picking = "off"  # then "armed", then "searching"
         self._nodes: list[PoseNodes] = []
         self._list: Any = None
-        self._server = start_server(host, port)
+        self._server, self._token = start_server(host, port)
         try:
             self._scene = PageScene(self._server, view, self._part)
             self._add_controls()
@@ -75,10 +76,8 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
-        host = self._server.get_host()
-        host = "localhost" if host in ("", "0.0.0.0", "::") else f"[{host}]" if ":" in host else host
-        return f"http://{host}:{self._server.get_port()}"
+        """Where the page is, with the token that it asks for."""
+        return f"{address(self._server.get_host(), self._server.get_port())}/?token={self._token}"
 
     def is_shown(self, rank: int, layer: str | None = None) -> bool:
         """Tell whether the pose of a rank, from 1 on, is switched on; with a layer, whether that is too."""

@@ -1,43 +1,124 @@
-"""The server of a page, on this machine only unless another host is named, and on the port that was asked for."""
+"""The server of a page, on this machine only unless another host is named, for those who know the page's address.
+
+The page is viser's, which answers everybody. What stands before it here asks for the token in the page's address, and
+refuses other hosts and pages of other sites.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import http
 import io
-import os
-import socket
+import logging
+import secrets
+import threading
+from collections.abc import Awaitable, Callable, Iterator
+from http.cookies import CookieError, SimpleCookie
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 from kmn_jax.errors import InputError
+from kmn_jax.web import is_allowed_host, is_same_origin, listen
+
+_MOST_BYTES = 1_000_000  # of a message; the page's own are small
+_NOT_READABLE = 1007  # of WebSocket's codes
+_STARTING = threading.Lock()
+_LOG = logging.getLogger("kmn_jax.page")  # where what clients do wrong ends
+_LOG.addHandler(logging.NullHandler())
+_LOG.propagate = False
 
 
-def start_server(host: str, port: int) -> Any:
-    """Return a running server; it would take another port by itself if this one is in use."""
-    if not 0 <= port <= 65535:
-        raise InputError(f"port {port} is not one: choose 1 to 65535, or 0 for any that is free")
-    try:
-        family, *_, address = socket.getaddrinfo(host or None, port, flags=socket.AI_PASSIVE)[0]
-        socket.create_server(address[:2], family=family).close()
-    except (socket.gaierror, UnicodeError):
-        raise InputError(f"host {host!r} is not known: 127.0.0.1 shows the page on this machine only") from None
-    except OSError as error:
-        why = os.strerror(error.errno or 0)
-        raise InputError(f"port {port} of {host} cannot be used ({why}): choose another one, or 0 for any") from None
+class Door:
+    """Lets those in who come with the token: in the address at first, in a cookie from then on."""
+
+    def __init__(self, host: str) -> None:
+        self._hosts = (host,) if host else ()
+        self._cookie = f"kmn_{secrets.token_hex(4)}"  # browsers do not tell the ports of a host apart
+        self.token = secrets.token_urlsafe(16)
+
+    def refusal(self, headers: Any, path: str) -> str | None:
+        """Tell why a request is refused, None if it is not."""
+        try:
+            host, origin, cookies = headers.get("Host", ""), headers.get("Origin"), headers.get("Cookie", "")
+        except LookupError:  # one of them is there twice
+            return "This request cannot be understood."
+        if not is_allowed_host(host, self._hosts):
+            return "This page is not served under that name."
+        if not is_same_origin(origin, host):
+            return "This page is not for pages of other sites."
+        given = [*parse_qs(urlsplit(path).query).get("token", []), self._cookie_in(cookies)]
+        if not any(secrets.compare_digest(one.encode(), self.token.encode()) for one in given):
+            return "Open the whole address that was printed, with its token."
+        return None
+
+    @property
+    def cookie(self) -> str:
+        """What a browser is told to send from then on."""
+        return f"{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+
+    def _cookie_in(self, header: str) -> str:
+        try:
+            found = SimpleCookie(header).get(self._cookie)
+        except CookieError:
+            return ""
+        return "" if found is None else found.value
+
+
+def start_server(host: str, port: int) -> tuple[Any, str]:
+    """Return a running server, and the token of its page; viser would take another port if this one is in use."""
+    listen(host, port).close()
     try:
         import viser
     except ImportError:
         raise InputError("the page needs a package that is not installed: pip install 'kmn_jax[view]'") from None
-    with contextlib.redirect_stdout(io.StringIO()):  # our caller says where the page is
+    door = Door(host)
+    with contextlib.redirect_stdout(io.StringIO()), _behind(door):  # our caller says where the page is
         server = viser.ViserServer(host=host, port=port, verbose=False)
     # The page could ask for a public address by a server elsewhere; scans stay here.
     server.request_share_url = lambda verbose=True: None
     if port not in (0, server.get_port()):
         stop_server(server)
         raise InputError(f"port {port} has just come into use: choose another one, or 0 for any that is free")
-    return server
+    return server, door.token
 
 
 def stop_server(server: Any) -> None:
     """Stop a server and its threads; pages that are open lose their connection."""
     with contextlib.redirect_stdout(io.StringIO()):  # it says so otherwise
         server.stop()
+
+
+@contextlib.contextmanager
+def _behind(door: Door) -> Iterator[None]:
+    """Let the server that viser starts meanwhile be one behind the door: viser has no setting for it."""
+    import websockets.asyncio.server as servers
+
+    def serve(handler: Callable[[Any], Awaitable[None]], *place: Any, **given: Any) -> Any:
+        answer = given["process_request"]
+
+        def checked(connection: Any, request: Any) -> Any:
+            refusal = door.refusal(request.headers, request.path)
+            if refusal is not None:
+                return connection.respond(http.HTTPStatus.FORBIDDEN, refusal + "\n")
+            response = answer(connection, request)
+            if response is not None:
+                response.headers["Set-Cookie"] = door.cookie
+            return response
+
+        async def handled(connection: Any) -> None:
+            try:
+                await handler(connection)
+            except Exception as error:
+                _LOG.info("a message could not be read", exc_info=error)
+                await connection.close(_NOT_READABLE, "a message could not be read")
+
+        limits = {"process_request": checked, "max_size": _MOST_BYTES, "logger": _LOG}
+        return plain(handled, *place, **given | limits)
+
+    with _STARTING:
+        plain = servers.serve
+        servers.serve = serve  # type: ignore[assignment, misc]
+        try:
+            yield
+        finally:
+            servers.serve = plain  # type: ignore[misc]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import shutil
 import socket
 import threading
@@ -10,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -272,8 +274,8 @@ def test_a_port_in_use_is_refused_and_a_stopped_page_frees_it(sample: tuple[Scen
     view, found = sample
     threads = set(threading.enumerate())
     page = Viewer(view, PART, found, port=0)
-    port = int(page.url.rsplit(":", 1)[1])
-    assert page.url == f"http://127.0.0.1:{port}"
+    port = urlsplit(page.url).port
+    assert re.fullmatch(rf"http://127\.0\.0\.1:{port}/\?token=[\w-]{{22}}", page.url)
     with pytest.raises(InputError, match=rf"port {port} of 127.0.0.1 cannot be used \(.*in use\): choose another one"):
         Viewer(view, PART, found, port=port)
     page.stop()
@@ -282,7 +284,8 @@ def test_a_port_in_use_is_refused_and_a_stopped_page_frees_it(sample: tuple[Scen
         trial.connect(("127.0.0.1", port))
     eventually(lambda: set(threading.enumerate()) <= threads)
     with Viewer(view, PART, found, port=port) as again:
-        assert again.url == page.url
+        assert urlsplit(again.url).port == port
+        assert again.url != page.url  # another token
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,157 @@
+"""A server process: its parts, its socket, its private folder, and its end."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import signal
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kmn_jax.detection import PoseEstimator
+from kmn_jax.errors import InputError, require
+from kmn_jax.io import MESH_SUFFIXES, Scan
+from kmn_jax.objects import Part
+from kmn_jax.serve._parts import PartStore, check_name
+from kmn_jax.serve._settings import ServeConfig
+from kmn_jax.serve._warm_up import PLACE, bracket, brackets_on_a_floor
+from kmn_jax.web import address, listen
+
+_PART_SUFFIXES = (*MESH_SUFFIXES, ".pcd", ".xyz", ".kmn")
+_AFTER_LIMITS = 10.0  # s that answers are waited for once all limits have passed
+
+
+def serve(
+    config: ServeConfig,
+    weights: str = "small",
+    parts: Path | None = None,
+    example: Path | None = None,
+    camera: Path | None = None,
+    started: Callable[[str], None] = lambda url: None,
+) -> None:
+    """Answer requests until SIGTERM or SIGINT, then those that are under way, and return.
+
+    Parts of a folder are prepared before; `started` is told the address. While an example scan, or else one that is
+    made up, is searched for the first part, which compiles everything, the server answers that it is not ready. Raises
+    InputError if a part or the example cannot be used, or if the port is in use.
+    """
+    import uvicorn
+
+    from kmn_jax.serve._app import make_app
+    from kmn_jax.serve._searches import Searches
+
+    require(camera is None or example is not None, "the camera is that of an example scan: name this, too (--example)")
+    listening = listen(config.host, config.port)
+    with contextlib.closing(listening), _private_folder() as folder:
+        estimator = PoseEstimator.from_pretrained(weights)
+        named = {} if parts is None else _prepared(estimator, parts)
+        store = PartStore(config.most_parts, named)
+        scan: Scan | None = None
+        if example is not None:
+            if not named:
+                raise InputError("an example scan needs the parts that are to be found in it: name their folder, too")
+            scan = estimator.read(example, next(iter(named.values())), None, camera)
+        stopping: list[Any] = []
+        failures: list[Exception] = []
+
+        def warm_up() -> None:
+            try:
+                search_all(estimator, next(iter(named.values()), None), scan)
+            except Exception as error:
+                failures.append(error)
+                stopping[0].should_exit = True
+                raise
+
+        app = make_app(Searches(estimator, weights, store, folder), config, warm_up)
+        server = stoppable(uvicorn.Server(uvicorn_config(app, config)))
+        stopping.append(server)
+        started(address(config.host, listening.getsockname()[1]))
+        server.run(sockets=[listening])
+    if failures:
+        raise failures[0]
+
+
+def uvicorn_config(app: Any, config: ServeConfig) -> Any:
+    """Return uvicorn's settings for an application."""
+    import uvicorn
+
+    from kmn_jax.serve._connections import BoundedConnection
+
+    return uvicorn.Config(
+        app,
+        http=functools.partial(BoundedConnection, config),  # type: ignore[arg-type]
+        ws="none",
+        loop="asyncio",
+        log_level="error",  # what clients do wrong is no news
+        access_log=False,
+        proxy_headers=False,
+        server_header=False,
+        timeout_graceful_shutdown=int(config.body_limit + config.time_limit + _AFTER_LIMITS),
+    )
+
+
+def stoppable(server: Any) -> Any:
+    """Return a uvicorn server that SIGTERM and SIGINT end as if it had nothing more to do: its own dies of them."""
+
+    @contextlib.contextmanager
+    def handled() -> Iterator[None]:
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        signals = (signal.SIGINT, signal.SIGTERM)
+        before = {number: signal.signal(number, server.handle_exit) for number in signals}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    server.capture_signals = handled
+    return server
+
+
+def search_all(estimator: PoseEstimator, part: Part | None, scan: Scan | None) -> None:
+    """Search a whole scan, one place of it, and draw it: so everything is compiled and imported that requests need."""
+    from kmn_jax.viz import save_picture
+
+    made_up = part is None or scan is None
+    used = estimator.prepare(bracket(), "mm", "bracket") if part is None or scan is None else part
+    scene = estimator.scene(brackets_on_a_floor() if scan is None else scan, used)
+    found = estimator.detect(used, scene)
+    place = np.array(PLACE) if made_up else found.poses[0].seed if found.poses else None
+    if place is not None:
+        estimator.detect(used, scene, at=place)
+    with tempfile.TemporaryDirectory() as folder:
+        save_picture(Path(folder, "picture.png"), scene, used, found)
+
+
+def _prepared(estimator: PoseEstimator, folder: Path) -> dict[str, Part]:
+    """Return the parts of a folder's files by their names."""
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder: name one that holds CAD files or cards")
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in _PART_SUFFIXES)
+    if not files:
+        raise InputError(f"{folder} holds no part: put CAD files or cards into it ({', '.join(_PART_SUFFIXES)})")
+    named: dict[str, Part] = {}
+    for path in files:
+        if path.stem in named:
+            raise InputError(f"{folder} holds two files for the part {path.stem}: remove one")
+        named[check_name(path.stem)] = estimator.prepare(path)
+    return named
+
+
+@contextlib.contextmanager
+def _private_folder() -> Iterator[Path]:
+    """Make a folder that nobody else can read, in which all temporary files of this process go until it is removed."""
+    before = tempfile.tempdir
+    with tempfile.TemporaryDirectory(prefix="kmn-serve-") as folder:
+        tempfile.tempdir = folder
+        try:
+            yield Path(folder)
+        finally:
+            tempfile.tempdir = before
