@@ -31,6 +31,7 @@ from kmn_jax.geometry._se3 import (
     safe_sqrt,
     transform_points,
 )
+from kmn_jax.geometry._selection import ask_for_fast_selection, largest
 from kmn_jax.geometry._smoothing import SmoothConfig, smoothed, with_normals
 
 __all__ = [
@@ -39,6 +40,7 @@ __all__ = [
     "Intrinsics",
     "PaddedCloud",
     "SmoothConfig",
+    "ask_for_fast_selection",
     "compose",
     "crop_around",
     "depth_normals",
@@ -54,6 +56,7 @@ __all__ = [
     "intrinsics",
     "inverse",
     "k_nearest",
+    "largest",
     "largest_distance",
     "matrix_to_quaternion",
     "measured_points",
