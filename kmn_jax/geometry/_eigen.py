@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from kmn_jax.typing import Scalar
 
+_AT_ONCE = 8  # on accelerators, where every round of a loop is a kernel to start
 _SQUARINGS = 24  # 2**24 power iterations: eigenvalues closer than float32 can tell apart no longer matter
 
 
@@ -34,7 +37,12 @@ def dominant_eigenvector(matrix: Float[Array, "d d"]) -> Float[Array, " d"]:
         inverse_trace = 1 / sum((squared[entry[i, i]] for i in range(size)), jnp.zeros_like(m[0]))
         return tuple(value * inverse_trace for value in squared)
 
-    projector = jax.lax.fori_loop(0, _SQUARINGS, square, normalised)
+    def squared_often(*m: Scalar, at_once: int) -> tuple[Scalar, ...]:
+        return jax.lax.fori_loop(0, _SQUARINGS, square, m, unroll=at_once)
+
+    projector = jax.lax.platform_dependent(
+        *normalised, cpu=partial(squared_often, at_once=1), default=partial(squared_often, at_once=_AT_ONCE)
+    )
     largest, column = projector[0], [projector[entry[0, j]] for j in range(size)]
     for i in range(1, size):
         larger = projector[entry[i, i]] > largest
