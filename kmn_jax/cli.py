@@ -294,8 +294,11 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line: 0 is success, 2 bad input (one sentence on stderr), 1 our own failure."""
     arguments = _joined(sys.argv[1:] if arguments is None else arguments)
     commands: dict[str, Any] = {call.__name__: call for call in (prepare, detect, view, export, convert)}
+    from kmn_jax.geometry import ask_for_fast_selection
+
     try:
         _keep_compiled()
+        ask_for_fast_selection()
         tyro.extras.subcommand_cli_from_dict(commands, prog="kmn", args=arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # nobody reads on, as in `kmn detect ... | head -1`

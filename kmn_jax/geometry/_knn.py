@@ -14,6 +14,7 @@ from kmn_jax.errors import InputError
 from kmn_jax.geometry._selection import largest_in_any_order
 
 _COORDINATES = 3
+_FAR = 1e38  # of masked points, half a squared distance: infinities become no numbers where products are split
 _CPU_PARTS = 32  # fewer than about ten ready operations XLA's CPU runtime keeps on one thread
 _CPU_ROWS = 16  # for fewer rows, fewer parts: these take longer to compile than they save
 
@@ -56,7 +57,7 @@ def k_nearest(
         points,
         mask,
         cpu=partial(_k_smallest_in_parts, k=k),
-        default=partial(_k_smallest, k=k, select=largest_in_any_order),
+        default=partial(_k_smallest_at_once, k=k),
     )
     return _repeat_nearest(*selected)
 
@@ -74,7 +75,7 @@ def neighbor_graph(points: Float[Array, "n c"], k: int, mask: Bool[Array, " n"] 
         points,
         mask,
         cpu=partial(_k_smallest_own_part_first, k=k),
-        default=lambda points, mask: _k_smallest(points, points, mask, k, largest_in_any_order),
+        default=lambda points, mask: _k_smallest_at_once(points, points, mask, k),
     )
     return _repeat_nearest(*selected)
 
@@ -106,6 +107,27 @@ def _k_smallest(
         distances = jnp.where(mask[None, :], distances, jnp.inf)
     values, indices = select(-distances, k)
     # Under shard_map XLA fails where one barrier, the caller's, takes both results as they are.
+    return jax.lax.optimization_barrier(values), jax.lax.optimization_barrier(indices)
+
+
+def _k_smallest_at_once(
+    queries: Float[Array, "n c"], points: Float[Array, "m c"], mask: Bool[Array, " m"] | None, k: int
+) -> tuple[Float[Array, "n k"], Int[Array, "n k"]]:
+    """The same for accelerators, where what takes time is to write distances and to read them.
+
+    Wider features are multiplied such that the product itself tells which point is nearer: q . p - |p|^2 / 2 is minus
+    half the squared distance, but for a term of the query's own. Values are these, infinite for masked points.
+    """
+    if points.shape[1] <= _COORDINATES:
+        return _k_smallest(queries, points, mask, k, largest_in_any_order)
+    queries, points = queries.astype(jnp.float32), points.astype(jnp.float32)
+    halves = 0.5 * (points**2).sum(axis=1, keepdims=True)
+    if mask is not None:
+        points, halves = jnp.where(mask[:, None], points, 0), jnp.where(mask[:, None], halves, _FAR)
+    queries = jnp.concatenate([queries, jnp.ones((queries.shape[0], 1))], axis=1)
+    points = jnp.concatenate([points, -halves], axis=1)
+    values, indices = largest_in_any_order(jnp.matmul(queries, points.T, precision=jax.lax.Precision.HIGHEST), k)
+    values = jnp.where(values < -_FAR / 2, -jnp.inf, values)
     return jax.lax.optimization_barrier(values), jax.lax.optimization_barrier(indices)
 
 

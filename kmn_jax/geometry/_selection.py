@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from functools import partial
+from importlib.util import find_spec
 
 import jax
 from jaxtyping import Array, Int, Shaped
@@ -12,6 +13,7 @@ from jaxtyping import Array, Int, Shaped
 # From version 0.11 on JAX takes a promise back; before that, XLA has to be told: see `ask_for_fast_selection`.
 _ANY_TIES = {"is_stable": False} if "is_stable" in inspect.signature(jax.lax.top_k).parameters else {}
 _FLAG = "xla_gpu_experimental_use_raft_select_k"
+_GPU_PACKAGES = ("jax_cuda12_plugin", "jax_cuda13_plugin")
 
 
 def largest(values: Shaped[Array, "... n"], k: int) -> tuple[Shaped[Array, "... k"], Int[Array, "... k"]]:
@@ -30,8 +32,9 @@ def largest_in_any_order(values: Shaped[Array, "... n"], k: int) -> tuple[Shaped
 def ask_for_fast_selection() -> None:
     """Have XLA select on NVIDIA GPUs by a library where JAX cannot ask for it; call it before JAX is used.
 
-    Otherwise it sorts whole rows for more than 16 of each. Versions of JAX that can ask need nothing.
+    Otherwise it sorts whole rows for more than 16 of each. Versions of JAX that can ask need nothing, and without JAX
+    for GPUs nothing changes.
     """
     given = os.environ.get("XLA_FLAGS", "")
-    if not _ANY_TIES and _FLAG not in given:
+    if not _ANY_TIES and _FLAG not in given and any(map(find_spec, _GPU_PACKAGES)):
         os.environ["XLA_FLAGS"] = f"{given} --{_FLAG}=true".strip()

@@ -34,11 +34,22 @@ def points() -> jax.Array:
         lambda x: jnp.sort(k_nearest(x[:40], x, 17)),
         lambda x: jnp.sort(neighbor_graph(x, 17)),
         lambda x: jnp.sort(neighbor_graph(jnp.tanh(jnp.concatenate([x, 2 * x], axis=1)), 17)),
+        lambda x: jnp.sort(k_nearest(jnp.tile(x[:40], 2), jnp.tile(x, 2), 17, jnp.arange(len(x)) % 3 > 0)),
+        lambda x: k_nearest(jnp.tile(x[:40], 2), jnp.tile(x, 2), 17, jnp.arange(len(x)) == 5),
         lambda x: jax.vmap(lambda y: dominant_eigenvector(jnp.outer(y, y) + jnp.eye(3)))(x),
         lambda x: normals_within_radius(x, x, 1.0),
         lambda x: largest(x[:, 0], 30),
     ],
-    ids=["k_nearest", "neighbor_graph", "neighbors of features", "eigenvectors", "planes", "selection"],
+    ids=[
+        "k_nearest",
+        "neighbor_graph",
+        "neighbors of features",
+        "masked features",
+        "one real",
+        "eigenvectors",
+        "planes",
+        "selection",
+    ],
 )
 def test_both_forms_agree(function: Callable[[jax.Array], Any], points: jax.Array, monkeypatch: Any) -> None:
     of_cpu = jax.jit(lambda x: function(x))(points)
@@ -57,6 +68,10 @@ def test_both_forms_agree(function: Callable[[jax.Array], Any], points: jax.Arra
 
 def test_only_versions_of_jax_that_cannot_ask_for_fast_selection_tell_xla(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XLA_FLAGS", "--xla_some=1")
+    monkeypatch.setattr(_selection, "_ANY_TIES", {})
+    monkeypatch.setattr(_selection, "_GPU_PACKAGES", ("jax_for_no_gpu",))
+    ask_for_fast_selection()
+    monkeypatch.setattr(_selection, "_GPU_PACKAGES", ("jax_for_no_gpu", "jax"))
     monkeypatch.setattr(_selection, "_ANY_TIES", {"is_stable": False})
     ask_for_fast_selection()
     assert _selection.os.environ["XLA_FLAGS"] == "--xla_some=1"
