@@ -1,10 +1,13 @@
 """What XLA makes of the programs that matter on devices that are not there: kernels, bytes, loops, times on paper.
 
-python -m benchmarks.compiled --target h200 [--only "network, 64"] [--texts FOLDER] [--json FILE]
+python -m benchmarks.compiled --target h200 [--only "network, 64"] [--texts FOLDER] [--measure] [--json FILE]
 
 Needs the environment of `make compile-env`: run it by .venv-compile/bin/python. Nothing is run, so every time is
 computed: a floor from the vendor's ceilings, and what is expected from the guesses in `compiled_targets.py`, both with
 kernels one after the other. Loops whose length only the data knows are taken to make `trips` trips.
+
+With `--measure` the programs are compiled for the device that is there, counted the same, and also timed, on drawn
+numbers: what was expected beside what is.
 """
 
 from __future__ import annotations
@@ -17,16 +20,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
 import tyro
 
 from benchmarks.compiled_counts import Counts, Kernel, count
 from benchmarks.compiled_hlo import parse_module
 from benchmarks.compiled_programs import Program, programs
 from benchmarks.compiled_targets import TARGETS, Target, devices_of, prepare, seconds, seconds_of
+from benchmarks.timing import time_in_turn
 from kmn_jax.errors import InputError
+from kmn_jax.geometry import ask_for_fast_selection
 from kmn_jax.report import print_table, write_json
 
 _NAMED = 5  # of the longest terms of a program
+_REPEATS = 9
 
 
 def main(
@@ -34,6 +42,7 @@ def main(
     only: tuple[str, ...] = (),
     trips: int = 8,
     texts: Path | None = None,
+    measure: bool = False,
     json: Path | None = None,
 ) -> None:
     """Compile programs and count them.
@@ -43,20 +52,26 @@ def main(
         only: parts of the names of programs; without any, all.
         trips: of loops whose length only the data knows.
         texts: folder for compiled programs' texts, from which those that are there already are counted again.
+        measure: run them on the device that is there, of which `target` only gives the ceilings.
         json: where results go; written after each program.
     """
     if target not in TARGETS:
         raise InputError(f"there is no target {target!r}: choose {', '.join(TARGETS)}")
     where = TARGETS[target]
-    prepare(where)
-    found, devices = programs(where.devices), devices_of(where)
+    if measure:
+        ask_for_fast_selection()
+    else:
+        prepare(where)
+    found, devices = programs(where.devices), jax.devices()[: where.devices] if measure else devices_of(where)
+    if len(devices) < where.devices:
+        raise InputError(f"{target} are {where.devices} devices, but there are only {len(devices)} here")
     chosen = [program for program in found if not only or any(part in program.name for part in only)]
     if not chosen:
         raise InputError(f"no program's name holds {only}: there are {', '.join(program.name for program in found)}")
     rows: list[dict[str, Any]] = []
     details: dict[str, Any] = {}
     for program in chosen:
-        text, facts = _compiled(program, devices, texts and texts / target)
+        text, facts = _compiled(program, devices, None if texts is None or measure else texts / target, measure)
         counts = count(parse_module(text), trips)
         rows.append(_row(program, counts, facts, where))
         details[program.name] = _details(counts, where) | facts
@@ -66,8 +81,8 @@ def main(
     print_table(f"programs compiled for {target}", rows)
 
 
-def _compiled(program: Program, devices: list[Any], folder: Path | None) -> tuple[str, dict[str, Any]]:
-    """Return the text of a compiled program and its memory; both from a folder if they are there."""
+def _compiled(program: Program, devices: list[Any], folder: Path | None, measure: bool) -> tuple[str, dict[str, Any]]:
+    """Return the text of a compiled program, its memory and perhaps its time; from a folder if they are there."""
     name = re.sub(r"\W+", "-", program.name)
     kept = None if folder is None else folder / f"{name}.hlo.gz"
     if kept is not None and kept.exists():
@@ -86,12 +101,45 @@ def _compiled(program: Program, devices: list[Any], folder: Path | None) -> tupl
         "temporary MB": memory.temp_size_in_bytes / 1e6,
         "argument MB": memory.argument_size_in_bytes / 1e6,
     }
+    if measure:
+        facts |= _measured(compiled, arguments, program.goes_on)
     text = compiled.as_text()
     if kept is not None:
         kept.parent.mkdir(parents=True, exist_ok=True)
         with gzip.open(kept, "wt") as file:
             file.write(json_module.dumps(facts) + "\n" + text)
     return text, facts
+
+
+def _measured(compiled: Callable[..., Any], arguments: tuple[Any, ...], goes_on: bool) -> dict[str, float]:
+    """Return the time of a program on drawn numbers."""
+    drawn = list(drawn_like(arguments))
+
+    def call() -> Any:
+        result = compiled(*drawn)
+        if goes_on:
+            drawn[0] = result[0]
+        return result
+
+    times = time_in_turn({"": call}, _REPEATS)[""]
+    return {"measured ms": times.median_ms, "measured min ms": times.minimum_ms}
+
+
+def drawn_like(shapes: Any) -> Any:
+    """Return arrays of such shapes and places: normal numbers, small whole ones, and masks that are all true."""
+
+    def draw(number: int, leaf: Any) -> jax.Array:
+        rng = np.random.default_rng(number)
+        if leaf.dtype == np.bool_:
+            values = np.ones(leaf.shape, np.bool_)
+        elif np.issubdtype(leaf.dtype, np.integer):
+            values = np.ones(leaf.shape, leaf.dtype)
+        else:
+            values = np.abs(rng.standard_normal(leaf.shape, dtype=np.float32)) + np.float32(0.1)
+        return jax.device_put(values, leaf.sharding)
+
+    leaves, structure = jax.tree.flatten(shapes)
+    return jax.tree.unflatten(structure, [draw(number, leaf) for number, leaf in enumerate(leaves)])
 
 
 def _row(program: Program, counts: Counts, facts: dict[str, Any], target: Target) -> dict[str, Any]:
@@ -117,6 +165,14 @@ def _row(program: Program, counts: Counts, facts: dict[str, Any], target: Target
         "floor ms": 1e3 * floor,
         "expected ms": 1e3 * expected,
         f"expected {program.item}s/s": program.items / expected,
+    } | ({} if "measured ms" not in facts else _beside(facts["measured ms"], 1e3 * expected, program))
+
+
+def _beside(measured_ms: float, expected_ms: float, program: Program) -> dict[str, float]:
+    return {
+        "measured ms": measured_ms,
+        f"measured {program.item}s/s": 1e3 * program.items / measured_ms,
+        "x expected": measured_ms / expected_ms,
     }
 
 
@@ -140,7 +196,7 @@ def _longest(counts: Counts, target: Target) -> list[dict[str, Any]]:
     def taken(kernels: list[Kernel], of: Callable[[Kernel], float]) -> float:
         return sum(kernel.times * of(kernel) for kernel in kernels)
 
-    rows = [
+    rows: list[dict[str, Any]] = [
         {
             "origin": origin,
             "kind": kind,
@@ -150,7 +206,7 @@ def _longest(counts: Counts, target: Target) -> list[dict[str, Any]]:
         }
         for (origin, kind), kernels in groups.items()
     ]
-    return sorted(rows, key=lambda row: -float(row["expected ms"]))[:_NAMED]
+    return sorted(rows, key=lambda row: row["expected ms"], reverse=True)[:_NAMED]
 
 
 if __name__ == "__main__":

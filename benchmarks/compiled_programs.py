@@ -43,7 +43,8 @@ class Program:
     name: str
     items: int
     item: str
-    make: Callable[[list[Any]], tuple[Callable[..., Any], tuple[Any, ...]]]  # of the devices
+    make: Callable[[list[Any]], tuple[Any, tuple[Any, ...]]]  # of the devices
+    goes_on: bool = False  # whether its first result is the first argument of the next call, whose memory it reuses
 
 
 def programs(devices: int) -> list[Program]:
@@ -78,8 +79,8 @@ def _forward(batch: int, compute: Compute) -> Program:
         return jax.vmap(one)(crops, parts)
 
     config = RELEASED_CONFIG
-    crops = jax.ShapeDtypeStruct((batch, config.num_scene_points, 6), jnp.float32)
-    parts = jax.ShapeDtypeStruct((batch, config.num_keypoints, config.object_width), jnp.float32)
+    crops = _array((batch, config.num_scene_points, 6), jnp.float32)
+    parts = _array((batch, config.num_keypoints, config.object_width), jnp.float32)
     name = f"network, {batch} crops, {compute}"
     return Program(
         name, batch, "crop", lambda devices: (jax.jit(forward), _on(devices, (model.parameters, crops, parts)))
@@ -89,7 +90,7 @@ def _forward(batch: int, compute: Compute) -> Program:
 def _crops(batch: int) -> Program:
     """The released network, from a scan's points to refined poses."""
 
-    def make(devices: list[Any]) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+    def make(devices: list[Any]) -> tuple[Any, tuple[Any, ...]]:
         model = load_pretrained("small")
         part = arrays_of(model, make_part(small_case()[0], model))
         config = SEARCH.of_network(model.config)
@@ -102,10 +103,8 @@ def _crops(batch: int) -> Program:
 
             return jax.vmap(one)(clouds, keys)
 
-        clouds = PaddedCloud(
-            jax.ShapeDtypeStruct((batch, _CLOUD, 3), jnp.float32), jax.ShapeDtypeStruct((batch, _CLOUD), jnp.bool_)
-        )
-        keys = jax.ShapeDtypeStruct((batch, 2), jnp.uint32)
+        clouds = PaddedCloud(_array((batch, _CLOUD, 3), jnp.float32), _array((batch, _CLOUD), jnp.bool_))
+        keys = _array((batch, 2), jnp.uint32)
         return jax.jit(solve), _on(devices, (model.parameters, part, clouds, keys))
 
     return Program(f"crop to poses, {batch} crops, small", batch, "crop", make)
@@ -114,7 +113,7 @@ def _crops(batch: int) -> Program:
 def _bin(seeds: int) -> Program:
     """The released network, from a depth image to ranked poses."""
 
-    def make(devices: list[Any]) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+    def make(devices: list[Any]) -> tuple[Any, tuple[Any, ...]]:
         model = load_pretrained("small")
         part = device_part(model, make_part(small_case()[0], model))
         search = BinPosesConfig().search
@@ -125,10 +124,10 @@ def _bin(seeds: int) -> Program:
             key = jax.random.wrap_key_data(key)
             return bin_poses(model.graphdef, parameters, part, calibration, image, inside, key, config)
 
-        number = jax.ShapeDtypeStruct((), jnp.float32)
-        image = DepthImage(jax.ShapeDtypeStruct(_IMAGE, jnp.float32), Intrinsics(*[number] * 6))
-        calibration = DeviceCalibration(jax.ShapeDtypeStruct((len(EVIDENCE),), jnp.float32), number)
-        inside, key = jax.ShapeDtypeStruct(_IMAGE, jnp.bool_), jax.ShapeDtypeStruct((2,), jnp.uint32)
+        number = _array((), jnp.float32)
+        image = DepthImage(_array(_IMAGE, jnp.float32), Intrinsics(*[number] * 6))
+        calibration = DeviceCalibration(_array((len(EVIDENCE),), jnp.float32), number)
+        inside, key = _array(_IMAGE, jnp.bool_), _array((2,), jnp.uint32)
         return jax.jit(solve), _on(devices, (model.parameters, part, calibration, image, inside, key))
 
     return Program(f"bin in one call, {seeds} seeds, small", 1, "bin", make)
@@ -137,7 +136,7 @@ def _bin(seeds: int) -> Program:
 def _step(name: str, compute: Compute, batch: int, devices: int) -> Program:
     """A training step with its data, sharded over all devices."""
 
-    def make(devices: list[Any]) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+    def make(devices: list[Any]) -> tuple[Any, tuple[Any, ...]]:
         config = find_config(name)
         config = replace(
             config,
@@ -150,13 +149,18 @@ def _step(name: str, compute: Compute, batch: int, devices: int) -> Program:
         graphdef, state = create_state(config.step, config.optimizer.build(config.num_steps))
         pack = stack_pack(Pack(_PACK), "train", config.examples.visibility == "bits").arrays
         pack = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((_OBJECTS, *leaf.shape[1:]), leaf.dtype), pack)
-        index, key = jax.ShapeDtypeStruct((batch,), jnp.int32), jax.ShapeDtypeStruct((batch, 2), jnp.uint32)
-        samples = SampleIndex(index, index, key, jax.ShapeDtypeStruct((batch,), jnp.bool_))
+        index, key = _array((batch,), jnp.int32), _array((batch, 2), jnp.uint32)
+        samples = SampleIndex(index, index, key, _array((batch,), jnp.bool_))
         step = jit_train_step(graphdef, config.optimizer, config.num_steps, config.step, mesh)
-        number = jax.ShapeDtypeStruct((), jnp.int32)
+        number = _array((), jnp.int32)
         return step, (*_placed((state, pack), whole), _placed(samples, shared), _placed(number, whole))
 
-    return Program(f"training step, {name}, {batch} samples, {compute}", batch, "sample", make)
+    return Program(f"training step, {name}, {batch} samples, {compute}", batch, "sample", make, True)
+
+
+def _array(extents: tuple[int, ...], kind: Any) -> Any:
+    """Return a shape, which takes the place of an array."""
+    return jax.ShapeDtypeStruct(extents, kind)
 
 
 def _on(devices: list[Any], arguments: Any) -> Any:

@@ -34,6 +34,7 @@ device_description_str: "NVIDIA H200"
 # There is no device to try algorithms of products on, and without trials those of Triton find no tiles for edges. What
 # comes after the program that is counted, machine code, need not be good.
 _CUDA_FLAGS = {
+    "xla_gpu_experimental_use_raft_select_k": "true",  # as kmn_jax.geometry.ask_for_fast_selection does
     "xla_gpu_autotune_level": "0",
     "xla_gpu_enable_triton_gemm": "false",
     "xla_backend_optimization_level": "0",
