@@ -6,16 +6,18 @@ UV := 0.13.9
 BIN := .venv/bin
 READY := .venv/.ready
 BENCH_READY := .venv/.bench-ready
+COMPILE_READY := .venv-compile/.ready
+NEWEST ?= python3.12
 TYPED := $(sort $(patsubst %/,%,$(dir $(wildcard kmn_jax/*.py configs/*.py experiments/*.py benchmarks/*.py))))
 COMPILE := .venv-lock/bin/uv --no-config pip compile --quiet --generate-hashes --no-emit-index-url \
 	--no-emit-find-links --custom-compile-command "make lock" $(LOCK)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test check format bench bench-env attack docs lock clean
+.PHONY: help demo test check format bench bench-env compile-env newest attack docs lock clean
 
 help: ## list these verbs
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' Makefile
 
 demo: $(READY) ## find parts in the small test set beside two rivals, and write a report
 	$(BIN)/python -m experiments.evaluate demo
@@ -40,6 +42,14 @@ attack: $(READY) ## read 20,000 damaged files of every format: about 20 minutes
 
 bench-env: $(BENCH_READY) ## add PyTorch, for the benchmarks and the tests marked torch
 
+compile-env: $(COMPILE_READY) ## add compilers for GPUs and TPUs that are not here (gigabytes), for benchmarks.compiled
+
+newest: ## the tests of geometry, models and poses on Python 3.12 or later (NEWEST=python3.13) with the newest jax
+	$(NEWEST) -m venv .venv-newest
+	.venv-newest/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager --editable . \
+		beartype hypothesis optax pytest pytest-timeout pytest-xdist
+	.venv-newest/bin/python -m pytest tests/geometry tests/models tests/pose
+
 docs: $(READY) ## build the documentation into site/, and run the examples of README.md and docs/
 	$(BIN)/mkdocs build --strict
 	$(BIN)/python -m pytest tests/test_docs.py
@@ -52,7 +62,7 @@ lock: ## compile pyproject.toml into the two locks (LOCK=--upgrade for newer ver
 		--no-annotate --python-version 3.11 --python-platform windows - -o requirements-bench.lock
 
 clean: ## remove the environments and caches
-	rm -rf .venv .venv-lock .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist site
+	rm -rf .venv .venv-lock .venv-compile .venv-newest .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist site
 
 $(READY): requirements.lock pyproject.toml .ci/environment
 	PYTHON="$(PYTHON)" .ci/environment
@@ -65,4 +75,13 @@ $(BENCH_READY): $(READY) requirements-bench.lock
 	$(BIN)/python -m pip install --quiet --require-hashes --only-binary=:all: -r requirements-bench.lock
 	$(BIN)/python -m pip install --quiet --no-deps torch==$(TORCH)
 	$(BIN)/python -c 'import torch' || $(BIN)/python -m pip install --quiet torch==$(TORCH)
+	@touch $@
+
+# Compilers alone: jax and all else come from .venv, whose versions they must match. They stay out of .venv, since jax
+# would look for their devices at every start.
+$(COMPILE_READY): $(READY)
+	$(BIN)/python -m venv .venv-compile
+	$(BIN)/python -c 'import site; print(site.getsitepackages()[0])' >$$(echo .venv-compile/lib/python*/site-packages)/shared.pth
+	version=$$($(BIN)/python -c 'import jax; print(jax.__version__)') && .venv-compile/bin/python -m pip install \
+		--quiet "jax-cuda12-plugin[with-cuda]==$$version" "jax[tpu]==$$version"
 	@touch $@

@@ -16,6 +16,7 @@ import tyro
 
 from configs import CONFIGS, find_config
 from kmn_jax.errors import InputError
+from kmn_jax.geometry import ask_for_fast_selection
 from kmn_jax.train import NotFiniteError, TrainConfig, initialize_distributed, split_cpu, train
 
 
@@ -41,6 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
             return 0 if name in ("-h", "--help") else 2
         options = _parse(name, rest)
         folder = options.folder or Path("runs") / name
+        ask_for_fast_selection()
         if not initialize_distributed(options.coordinator, options.processes, options.process):
             pipeline, at_once = options.config.pipeline, options.config.crops_at_once
             split_cpu(pipeline.batch_size // max(pipeline.crops_per_object, at_once or 1))

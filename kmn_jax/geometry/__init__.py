@@ -32,6 +32,7 @@ from kmn_jax.geometry._se3 import (
     safe_sqrt,
     transform_points,
 )
+from kmn_jax.geometry._selection import ask_for_fast_selection, largest
 from kmn_jax.geometry._smoothing import SmoothConfig, smoothed, with_normals
 
 __all__ = [
@@ -41,6 +42,7 @@ __all__ = [
     "PaddedCloud",
     "PointGroups",
     "SmoothConfig",
+    "ask_for_fast_selection",
     "compose",
     "crop_around",
     "depth_normals",
@@ -57,6 +59,7 @@ __all__ = [
     "intrinsics",
     "inverse",
     "k_nearest",
+    "largest",
     "largest_distance",
     "matrix_to_quaternion",
     "measured_points",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -14,7 +15,8 @@ from kmn_jax.geometry._normals import _plane_normals
 from kmn_jax.geometry._rows import real_rows
 from kmn_jax.typing import Scalar
 
-_BLOCK = 64  # queries at once: their distances to a few thousand points stay in a core's cache
+_CPU_BLOCK = 64  # queries at once: their distances to a few thousand points stay in a core's cache
+_MOST_DISTANCES = 2**24  # at once elsewhere, where every block is a few kernels to start: 64 MiB
 
 
 class LocalPlanes(NamedTuple):
@@ -67,9 +69,16 @@ def planes_within_radius(
         near = squared_distances(block, points) <= radius**2
         return jnp.matmul(near.astype(jnp.float32), moments, precision=jax.lax.Precision.HIGHEST)
 
-    num_blocks = -(-count // _BLOCK)
-    blocks = jnp.pad(queries, ((0, num_blocks * _BLOCK - count), (0, 0))).reshape(num_blocks, _BLOCK, 3)
-    number, *rest = jax.lax.map(sums, blocks).reshape(-1, 16)[:count, : len(columns)].T
+    def in_blocks(queries: Float[Array, "q 3"], size: int) -> Float[Array, "q 16"]:
+        num_blocks = -(-count // size)
+        blocks = jnp.pad(queries, ((0, num_blocks * size - count), (0, 0))).reshape(num_blocks, size, 3)
+        return jax.lax.map(sums, blocks).reshape(-1, 16)[:count]
+
+    large = max(1, min(count, _MOST_DISTANCES // points.shape[0]))
+    found = jax.lax.platform_dependent(
+        queries, cpu=partial(in_blocks, size=_CPU_BLOCK), default=partial(in_blocks, size=large)
+    )
+    number, *rest = found[:, : len(columns)].T
     normals, valid = _plane_normals(number, rest[:3], rest[3:])
     number = jnp.maximum(number, 1)
     mean = jnp.stack(rest[:3], axis=1) / number[:, None]

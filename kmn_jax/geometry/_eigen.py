@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from kmn_jax.typing import Scalar
 
+_AT_ONCE = 12  # on accelerators, where every round of a loop is a kernel to start; all at once compiles for long
 _SQUARINGS = 24  # 2**24 power iterations: eigenvalues closer than float32 can tell apart no longer matter
 
 
@@ -29,12 +32,20 @@ def dominant_eigenvector(matrix: Float[Array, "d d"]) -> Float[Array, " d"]:
     inverse_scale = jnp.where(scale > 0, 1 / jnp.where(scale > 0, scale, 1), 0)
     normalised = tuple(jnp.where(scale > 0, matrix[i, j] * inverse_scale, (i == j) / size) for i, j in upper)
 
-    def square(_: Int[Array, ""], m: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+    def square(_: Any, m: tuple[Any, ...]) -> tuple[Any, ...]:
         squared = [sum((m[entry[i, k]] * m[entry[k, j]] for k in range(size)), jnp.zeros_like(m[0])) for i, j in upper]
         inverse_trace = 1 / sum((squared[entry[i, i]] for i in range(size)), jnp.zeros_like(m[0]))
         return tuple(value * inverse_trace for value in squared)
 
-    projector = jax.lax.fori_loop(0, _SQUARINGS, square, normalised)
+    def in_few_kernels(*m: Scalar) -> tuple[Scalar, ...]:
+        # Rows of one, since XLA starts a kernel for each scalar, but one for all arrays of a shape.
+        rows = tuple(value[None] for value in m)
+        rows = jax.lax.fori_loop(0, _SQUARINGS, square, rows, unroll=_AT_ONCE)
+        return tuple(row[0] for row in rows)
+
+    projector = jax.lax.platform_dependent(
+        *normalised, cpu=lambda *m: jax.lax.fori_loop(0, _SQUARINGS, square, m), default=in_few_kernels
+    )
     largest, column = projector[0], [projector[entry[0, j]] for j in range(size)]
     for i in range(1, size):
         larger = projector[entry[i, i]] > largest

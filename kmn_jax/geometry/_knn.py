@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from kmn_jax.errors import InputError
+from kmn_jax.geometry._selection import largest_in_any_order
 
 _COORDINATES = 3
+_FAR = 1e38  # of masked points, half a squared distance: infinities become no numbers where products are split
 _CPU_PARTS = 32  # fewer than about ten ready operations XLA's CPU runtime keeps on one thread
 _CPU_ROWS = 16  # for fewer rows, fewer parts: these take longer to compile than they save
 
@@ -41,15 +45,19 @@ def k_nearest(
 
     A query that is itself one of the points finds itself among them, unless k others are as near to float32
     (see `squared_distances`). Points where `mask` is false are never found; with fewer than k real points, the
-    list ends in repeats of the nearest one, so that a maximum over neighbours stays right. Ties go to the lower
-    index. All but masked points must be finite. Raises ValueError if k is not in [1, m].
+    list ends in repeats of the nearest one, so that a maximum over neighbours stays right. On CPUs, ties go to the
+    lower index. All but masked points must be finite. Raises ValueError if k is not in [1, m].
     """
     _check_k(k, points.shape[0])
     if queries.shape[0] == 0:
         return jnp.zeros((0, k), dtype=jnp.int32)
     queries, points = _centered(queries, points, mask)
     selected = jax.lax.platform_dependent(
-        queries, points, mask, cpu=partial(_k_smallest_in_parts, k=k), default=partial(_k_smallest, k=k)
+        queries,
+        points,
+        mask,
+        cpu=partial(_k_smallest_in_parts, k=k),
+        default=partial(_k_smallest_at_once, k=k),
     )
     return _repeat_nearest(*selected)
 
@@ -67,7 +75,7 @@ def neighbor_graph(points: Float[Array, "n c"], k: int, mask: Bool[Array, " n"] 
         points,
         mask,
         cpu=partial(_k_smallest_own_part_first, k=k),
-        default=lambda points, mask: _k_smallest(points, points, mask, k),
+        default=lambda points, mask: _k_smallest_at_once(points, points, mask, k),
     )
     return _repeat_nearest(*selected)
 
@@ -88,13 +96,38 @@ def _repeat_nearest(values: Float[Array, "n k"], indices: Int[Array, "n k"]) -> 
 
 
 def _k_smallest(
-    queries: Float[Array, "n c"], points: Float[Array, "m c"], mask: Bool[Array, " m"] | None, k: int
+    queries: Float[Array, "n c"],
+    points: Float[Array, "m c"],
+    mask: Bool[Array, " m"] | None,
+    k: int,
+    select: Callable[..., Any] = jax.lax.top_k,
 ) -> tuple[Float[Array, "n k"], Int[Array, "n k"]]:
     distances = squared_distances(queries, points)
     if mask is not None:
         distances = jnp.where(mask[None, :], distances, jnp.inf)
-    values, indices = jax.lax.top_k(-distances, k)
+    values, indices = select(-distances, k)
     # Under shard_map XLA fails where one barrier, the caller's, takes both results as they are.
+    return jax.lax.optimization_barrier(values), jax.lax.optimization_barrier(indices)
+
+
+def _k_smallest_at_once(
+    queries: Float[Array, "n c"], points: Float[Array, "m c"], mask: Bool[Array, " m"] | None, k: int
+) -> tuple[Float[Array, "n k"], Int[Array, "n k"]]:
+    """The same for accelerators, where what takes time is to write distances and to read them.
+
+    Wider features are multiplied such that the product itself tells which point is nearer: q . p - |p|^2 / 2 is minus
+    half the squared distance, but for a term of the query's own. Values are these, infinite for masked points.
+    """
+    if points.shape[1] <= _COORDINATES:
+        return _k_smallest(queries, points, mask, k, largest_in_any_order)
+    queries, points = queries.astype(jnp.float32), points.astype(jnp.float32)
+    halves = 0.5 * (points**2).sum(axis=1, keepdims=True)
+    if mask is not None:
+        points, halves = jnp.where(mask[:, None], points, 0), jnp.where(mask[:, None], halves, _FAR)
+    queries = jnp.concatenate([queries, jnp.ones((queries.shape[0], 1))], axis=1)
+    points = jnp.concatenate([points, -halves], axis=1)
+    values, indices = largest_in_any_order(jnp.matmul(queries, points.T, precision=jax.lax.Precision.HIGHEST), k)
+    values = jnp.where(values < -_FAR / 2, -jnp.inf, values)
     return jax.lax.optimization_barrier(values), jax.lax.optimization_barrier(indices)
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from kmn_jax.errors import InputError, float_array, is_traced, mask_array, positive_scalar, require
+from kmn_jax.geometry import largest
 from kmn_jax.typing import ArrayInput, Normals, Points, Scalar
 
 OBJECT_CLASS = 1  # segmentation logits are (background, object)
@@ -119,7 +120,7 @@ def _find_matches(
     scores = jax.nn.softmax(segmentation_logits, axis=1)[:, OBJECT_CLASS, None] * keypoint_scores
 
     size = min(config.capacity, n * k)
-    weights, flat = jax.lax.top_k(jnp.where(votes, scores, -1).reshape(-1), size)
+    weights, flat = largest(jnp.where(votes, scores, -1).reshape(-1), size)
     kept = weights >= 0
     point, keypoint = flat // k, flat % k
     padding = (0, config.capacity - size)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from kmn_jax.errors import InputError, float_array, is_traced, mask_array, positive_scalar, require, row_count
-from kmn_jax.geometry import from_rotation_translation
+from kmn_jax.geometry import from_rotation_translation, largest
 from kmn_jax.pose._kabsch import fit_rigid, rotation_is_determined
 from kmn_jax.pose._matches import Matches
 from kmn_jax.pose._result import PoseResult, PoseStatus, first_status
@@ -259,7 +259,7 @@ def _congruent_triplets(
     # A match drawn twice makes a triangle without height.
     proper = height >= _MIN_HEIGHT
     mismatch = jnp.sqrt(((object_sides - scene_sides) ** 2).sum(axis=0)) / jnp.where(proper, height, 1)
-    ranking, chosen = jax.lax.top_k(jnp.where(proper, -mismatch, -jnp.inf), config.num_hypotheses)
+    ranking, chosen = largest(jnp.where(proper, -mismatch, -jnp.inf), config.num_hypotheses)
     return triplets[:, chosen].T, jnp.isfinite(ranking)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ from kmn_jax.detection import (
     predict,
     search_draws,
 )
-from kmn_jax.detection._crop_search import crop_of_scene, find_poses_in_crop
+from kmn_jax.detection._crop_search import crop_of_scene, draws_side_by_side, find_poses_in_crop
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import PaddedCloud
 from kmn_jax.models import Model, load_model, released_file
@@ -176,6 +177,52 @@ def test_no_more_draws_are_made_than_it_takes(model: Model, part: PartArrays, ca
     np.testing.assert_array_equal(one.predictions.points[0], none.predictions.points[0])
     for leaf in jax.tree.leaves((one.predictions, one.poses)):
         np.testing.assert_array_equal(leaf[1:], np.zeros_like(leaf[1:]))
+
+
+def test_draws_side_by_side_are_those_made_in_turn(model: Model, part: PartArrays, cases: list[Case]) -> None:
+    config, key = replace(CONFIG, num_draws=3, enough=9.0), jax.random.key(0)
+    network = nnx.merge(model.graphdef, model.parameters)
+    crop = crop_of_scene(padded(cases[0].points), 0, part.diameter, key, config)
+    search = jax.jit(search_draws, static_argnums=(0, 4))
+    in_turn, at_once = (search(network, part, crop, key, replace(config, side_by_side=given)) for given in (None, True))
+    assert at_once.num_draws == in_turn.num_draws == 3
+    np.testing.assert_array_equal(at_once.poses.converged, in_turn.poses.converged)
+    # Programs that differ round differently.
+    np.testing.assert_allclose(at_once.poses.T_scene_object, in_turn.poses.T_scene_object, atol=1e-3)
+    np.testing.assert_allclose(at_once.scores, in_turn.scores, atol=1e-3)
+    np.testing.assert_allclose(at_once.predictions.logits, in_turn.predictions.logits, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("scores", "enough", "valid", "number"),
+    [
+        ([0.1, 0.8, 0.2], 0.7, True, 2),
+        ([0.9, 0.8, 0.2], 0.7, True, 1),
+        ([0.1, 0.2, 0.7], 0.7, True, 3),
+        ([-jnp.inf, -jnp.inf, -jnp.inf], 0.7, True, 3),
+        ([0.9, 0.8, 0.2], None, True, 3),
+        ([0.1, 0.2, 0.3], 0.7, False, 1),
+        ([0.1, 0.2, 0.3], None, False, 1),
+    ],
+)
+def test_draws_side_by_side_are_forgotten_where_none_would_follow(
+    scores: list[float], enough: float | None, valid: bool, number: int
+) -> None:
+    config = replace(CONFIG, num_draws=3, enough=enough)
+    poses = jnp.stack([jnp.array(scores), jnp.full(3, -jnp.inf)], axis=1)
+
+    def one(draw: jax.Array) -> Any:
+        return draw + 1, draw + 1
+
+    def scored(found: Any, so_far: Any) -> jax.Array:
+        return poses[found - 1] + (so_far.max() - found).astype(jnp.float32)  # by no draw after it
+
+    made = draws_side_by_side(one, scored, jnp.bool_(valid), config)
+    there = np.arange(3) < number
+    assert made.num_draws == number
+    for draws in (made.predictions, made.poses):
+        np.testing.assert_array_equal(draws, np.where(there, [1, 2, 3], 0))
+    np.testing.assert_allclose(made.scores[:, 0], np.where(there, scores, -np.inf), atol=1e-6)
 
 
 @pytest.mark.parametrize("num_draws", [1, 3, 7, 11])
