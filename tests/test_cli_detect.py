@@ -18,7 +18,8 @@ from kmn_jax.bop import bop_scan
 from kmn_jax.cli import main
 
 ASSETS = Path(__file__).parent.parent / "experiments" / "assets"
-IMAGE = sorted((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))[0]
+# The image of the estimator's tests, so that what they have compiled is read.
+IMAGE = max((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))
 MOTOR = ASSETS / "industrial" / "gear_motor.stl"
 SHAFT = ASSETS / "industrial" / "shaft.stl"
 
