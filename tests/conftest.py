@@ -48,6 +48,7 @@ def few_optimisations() -> Iterator[None]:
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", before)
+    jax.clear_caches()  # that are not asked how a program was compiled: other files would run the slow ones for minutes
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
