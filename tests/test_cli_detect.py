@@ -100,22 +100,6 @@ def test_a_relative_path_and_another_part(
     assert {row["obj_id"] for row in table(target)} <= {"1"}  # not that of the motor, which is 2
 
 
-def test_it_is_no_failure_if_nobody_reads_what_is_printed(tmp_path: Path) -> None:
-    target = tmp_path / "motor.kmn"
-    read, write = os.pipe()
-    os.close(read)
-    process = subprocess.run(
-        [sys.executable, "-m", "kmn_jax.cli", "prepare", str(MOTOR), "-o", str(target)],
-        stdout=write,
-        stderr=subprocess.PIPE,
-        text=True,
-        timeout=200,
-    )
-    os.close(write)
-    assert (process.returncode, process.stderr) == (0, "")
-    assert target.stat().st_size > 1000
-
-
 def test_bad_input_is_one_sentence_and_exit_2(
     card: Path, cloud: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
