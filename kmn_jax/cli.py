@@ -385,12 +385,12 @@ def _keep_compiled() -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line: 0 is success, 2 bad input (one sentence on stderr), 1 our own failure."""
     arguments = _joined(sys.argv[1:] if arguments is None else arguments)
-    from kmn_jax.geometry import ask_for_fast_selection
-
     try:
         run = _parsed(arguments)
-        _keep_compiled()
+        from kmn_jax.geometry import ask_for_fast_selection
+
         ask_for_fast_selection()
+        _keep_compiled()
         run()
         sys.stdout.flush()
     except BrokenPipeError:  # nobody reads on, as in `kmn detect ... | head -1`

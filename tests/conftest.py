@@ -7,9 +7,12 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from tests.reference.compiled import kept_programs
+from tests.reference.compiled import kept_programs, quick_flags
+from tests.reference.order import place
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+if os.environ["JAX_PLATFORMS"] == "cpu":
+    os.environ["XLA_FLAGS"] = quick_flags()
 
 # Compiling is most of what tests take: what a run, a worker or a command of a test has compiled is read by the next.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
@@ -45,9 +48,11 @@ def few_optimisations() -> Iterator[None]:
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", before)
+    jax.clear_caches()  # that are not asked how a program was compiled: other files would run the slow ones for minutes
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: place(item.path))
     has_torch = importlib.util.find_spec("torch") is not None
     for item in items:
         if item.get_closest_marker("torch") and not has_torch:

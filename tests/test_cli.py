@@ -13,6 +13,8 @@ from kmn_jax.cli import main
 from kmn_jax.models._torch_file import read_state_dict, state_dict_bytes
 from tests.golden.make_network import draw_state_dict
 
+PROGRAM = str(Path(sys.executable).with_name("kmn"))
+
 
 def test_convert_there_and_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tensors = draw_state_dict(1)
@@ -45,17 +47,16 @@ def test_bad_input_is_one_sentence_and_exit_2(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_command_is_installed_and_explains_itself() -> None:
-    program = str(Path(sys.executable).with_name("kmn"))
-    result = subprocess.run([program, "convert", "--help"], capture_output=True, text=True)
+    result = subprocess.run([PROGRAM, "convert", "--help"], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     assert "authors" in result.stdout
-    assert subprocess.run([program, "convert", "only-one"], capture_output=True).returncode == 2
+    assert main(["convert", "only-one"]) == 2
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ("", "Expected one of {prepare, detect, view, export, convert}: see kmn --help"),
+        ("", "Expected one of {prepare, detect, view, serve, export, convert}: see kmn --help"),
         ("nope", "Unrecognized options: nope"),
         ("detect", "Missing from kmn detect: --object PATH --scene PATH: see kmn detect --help"),
         ("detect --objct a --scene b", "Missing from kmn detect: --object PATH; Unrecognized options: --objct a"),
@@ -81,3 +82,14 @@ def test_an_interrupt_while_libraries_load_leaves_no_traceback(tmp_path: Path) -
         [sys.executable, "-m", "kmn_jax", "--help"], env=os.environ | {"PYTHONPATH": paths}, capture_output=True
     )
     assert (done.returncode, done.stdout, done.stderr) == (130, b"", b"")
+
+
+def test_it_is_no_failure_if_nobody_reads_what_is_printed(tmp_path: Path) -> None:
+    (tmp_path / "a.t7").write_bytes(state_dict_bytes(draw_state_dict(1)))
+    read, write = os.pipe()
+    os.close(read)
+    command = [PROGRAM, "convert", str(tmp_path / "a.t7"), str(tmp_path / "b.safetensors")]
+    process = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, timeout=200)
+    os.close(write)
+    assert (process.returncode, process.stderr) == (0, "")
+    assert (tmp_path / "b.safetensors").stat().st_size > 1000

@@ -21,7 +21,8 @@ from kmn_jax.serve import ServeConfig
 from tests.serve.serve_sample import running
 
 ASSETS = Path(__file__).parent.parent / "experiments" / "assets"
-IMAGE = sorted((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))[0]
+# The image of the estimator's tests, so that what they have compiled is read.
+IMAGE = max((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))
 MOTOR = ASSETS / "industrial" / "gear_motor.stl"
 SHAFT = ASSETS / "industrial" / "shaft.stl"
 
@@ -123,22 +124,6 @@ def test_a_relative_path_and_another_part(
     code = main(["detect", "--object", str(SHAFT), "--scene", IMAGE.name, "--bop-csv", str(target)])
     assert code == 0, capsys.readouterr().err
     assert {row["obj_id"] for row in table(target)} <= {"1"}  # not that of the motor, which is 2
-
-
-def test_it_is_no_failure_if_nobody_reads_what_is_printed(tmp_path: Path) -> None:
-    target = tmp_path / "motor.kmn"
-    read, write = os.pipe()
-    os.close(read)
-    process = subprocess.run(
-        [sys.executable, "-m", "kmn_jax.cli", "prepare", str(MOTOR), "-o", str(target)],
-        stdout=write,
-        stderr=subprocess.PIPE,
-        text=True,
-        timeout=200,
-    )
-    os.close(write)
-    assert (process.returncode, process.stderr) == (0, "")
-    assert target.stat().st_size > 1000
 
 
 def test_bad_input_is_one_sentence_and_exit_2(

@@ -1,4 +1,4 @@
-"""The locks are in step with pyproject.toml and with each other."""
+"""The locks are in step with pyproject.toml and with each other; the order of tests names files that there are."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from tests.reference.order import LONGEST, TESTS, place
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -54,3 +56,10 @@ def test_locks_agree() -> None:
         name: bench[name][0] for name in main.keys() & bench
     }
     assert "torch" not in main | bench
+
+
+def test_long_files_of_tests_begin_first() -> None:
+    others = set(TESTS.rglob("test_*.py")) - {TESTS / name for name in LONGEST}
+    assert [place(TESTS / name) for name in LONGEST] == list(range(len(LONGEST)))
+    assert all((TESTS / name).is_file() for name in LONGEST), "rename it in tests/reference/order.py, too"
+    assert {place(path) for path in others} == {len(LONGEST)}

@@ -13,6 +13,7 @@ from kmn_jax.bop import bop_scan
 from kmn_jax.detection import (
     EVIDENCE,
     DetectConfig,
+    Detections,
     ForegroundOptions,
     PoseEstimator,
     as_json,
@@ -33,7 +34,7 @@ from tests.reference.meshes import pose as placed
 from tests.reference.solids import revolution
 
 ASSETS = Path(__file__).parent.parent.parent / "experiments" / "assets"
-IMAGES = sorted((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))
+IMAGE = max((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))
 MOTOR = ASSETS / "industrial" / "gear_motor.stl"
 
 
@@ -47,10 +48,18 @@ def motor(estimator: PoseEstimator) -> Part:
     return estimator.prepare(MOTOR)
 
 
-def bin_of(row: int) -> tuple[Scan, np.ndarray]:
-    scan, instances = bop_scan(IMAGES[row])
+@pytest.fixture(scope="module")
+def seen() -> tuple[Scan, np.ndarray]:
+    """A bin, and the poses of its parts."""
+    scan, instances = bop_scan(IMAGE)
     assert instances is not None
     return scan, np.array([one.T_camera_object for one in instances], dtype=np.float32)
+
+
+@pytest.fixture(scope="module")
+def whole(estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray]) -> Detections:
+    """What is found in it."""
+    return estimator.detect(motor, seen[0])
 
 
 def errors(pose: np.ndarray, truth: np.ndarray, part: Part) -> np.ndarray:
@@ -58,9 +67,10 @@ def errors(pose: np.ndarray, truth: np.ndarray, part: Part) -> np.ndarray:
     return np.array([float(adi(pose.astype(np.float32), one, points)) for one in truth]) / part.diameter
 
 
-def test_a_bin_is_found_and_the_same_inputs_give_the_same_bits(estimator: PoseEstimator, motor: Part) -> None:
-    scan, truth = bin_of(-1)
-    found = estimator.detect(motor, scan)
+def test_a_bin_is_found_and_the_same_inputs_give_the_same_bits(
+    estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray], whole: Detections
+) -> None:
+    (scan, truth), found = seen, whole
     likely = [pose for pose in found.poses if pose.probability >= 0.5]
     right = [errors(pose.T_scene_object, truth, motor).min() < 0.1 for pose in likely]
     print(f"copies {len(truth)}, found {len(likely)}, right {sum(right)}, {found.timing}")
@@ -74,13 +84,10 @@ def test_a_bin_is_found_and_the_same_inputs_give_the_same_bits(estimator: PoseEs
         assert sum((pose.explained, pose.violated, pose.occluded, pose.unknown)) == pytest.approx(1, abs=1e-3)
         np.testing.assert_allclose(pose.T_scene_object[:3, :3] @ pose.T_scene_object[:3, :3].T, np.eye(3), atol=1e-12)
         assert len(pose.prediction.points) == len(pose.prediction.on_object) == len(pose.prediction.keypoint)
-    again = estimator.detect(motor, scan)
-    assert len(again.poses) == len(found.poses)
-    for one, other in zip(found.poses, again.poses, strict=True):
+    again = estimator.detect(motor, scan, top=len(found.poses) - 1)
+    for one, other in zip(found.poses[:-1], again.poses, strict=True):
         np.testing.assert_array_equal(one.T_scene_object, other.T_scene_object)
         assert one.probability == other.probability
-    top = estimator.detect(motor, scan, top=2)
-    assert [pose.probability for pose in top.poses] == [pose.probability for pose in found.poses[:2]]
     assert "found" in table(found, 0.5)
     written = as_json(found, "motor.stl", "bin.png", {"seed": 0})
     assert written["version"] == 1
@@ -91,8 +98,10 @@ def test_a_bin_is_found_and_the_same_inputs_give_the_same_bits(estimator: PoseEs
     assert written["timing"]["total_s"] == pytest.approx(found.timing.total)
 
 
-def test_units_frames_and_sensors_do_not_matter(estimator: PoseEstimator, motor: Part) -> None:
-    scan, truth = bin_of(0)
+def test_units_frames_and_sensors_do_not_matter(
+    estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray]
+) -> None:
+    scan, truth = seen
     in_metres = estimator.detect(motor, scan.in_unit("m"))
     assert in_metres.unit == "m"
     best = max(in_metres.poses, key=lambda pose: pose.probability)
@@ -107,9 +116,10 @@ def test_units_frames_and_sensors_do_not_matter(estimator: PoseEstimator, motor:
     assert errors(np.linalg.inv(T_world_camera) @ best.T_scene_object, truth, motor).min() < 0.1
 
 
-def test_places_and_crops_give_the_pose_there(estimator: PoseEstimator, motor: Part) -> None:
-    scan, truth = bin_of(0)
-    whole = estimator.detect(motor, scan)
+def test_places_and_crops_give_the_pose_there(
+    estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray], whole: Detections
+) -> None:
+    scan, truth = seen
     seed = max(whole.poses, key=lambda pose: pose.probability).seed
     other = scan.points[np.linalg.norm(scan.points - seed, axis=1).argmax()]
     scene = estimator.scene(scan, motor, at=np.stack([seed, other]))
@@ -122,8 +132,8 @@ def test_places_and_crops_give_the_pose_there(estimator: PoseEstimator, motor: P
     assert (poses == there.poses[0].T_scene_object).all(axis=(1, 2)).any(), "whatever else is asked for"
 
 
-def test_several_parts_share_a_scene(estimator: PoseEstimator, motor: Part) -> None:
-    scan, _ = bin_of(0)
+def test_several_parts_share_a_scene(estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray]) -> None:
+    scan, _ = seen
     scene = estimator.scene(scan, motor)
     twin = replace(motor, name="twin", diameter=motor.diameter * 1.0001)
     first, second = estimator.detect([motor, twin], scene)
@@ -132,8 +142,10 @@ def test_several_parts_share_a_scene(estimator: PoseEstimator, motor: Part) -> N
     assert estimator.detect([], scene) == ()
 
 
-def test_candidates_have_evidence_and_some_are_right(estimator: PoseEstimator, motor: Part) -> None:
-    scan, truth = bin_of(0)
+def test_candidates_have_evidence_and_some_are_right(
+    estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray]
+) -> None:
+    scan, truth = seen
     scene = estimator.scene(scan, motor)
     config = DetectConfig().search
     config = replace(config, crops=config.crops.of_network(estimator.model.config))
@@ -162,8 +174,10 @@ def test_a_symmetric_part_has_one_canonical_pose(estimator: PoseEstimator, mesh:
     assert np.trace(chosen[:3, :3]) >= np.trace(base[:3, :3]) - 1e-9
 
 
-def test_what_cannot_be_is_one_sentence(estimator: PoseEstimator, motor: Part, tmp_path: Path) -> None:
-    scan, _ = bin_of(0)
+def test_what_cannot_be_is_one_sentence(
+    estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray], tmp_path: Path
+) -> None:
+    scan, _ = seen
     with pytest.raises(InputError, match=r"say --units|metres"):
         estimator.detect(motor, scan.points, unit="m")
     with pytest.raises(InputError, match="region of interest"):
@@ -250,12 +264,12 @@ def test_parts_and_scans_may_lie_far_from_the_origin(estimator: PoseEstimator, m
 
 
 def test_an_exported_estimator_finds_the_same_without_this_package(
-    estimator: PoseEstimator, motor: Part, tmp_path: Path
+    estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray], tmp_path: Path
 ) -> None:
     import subprocess
     import sys
 
-    scan, truth = bin_of(0)
+    scan, truth = seen
     scene = estimator.scene(scan, motor)
     path = tmp_path / "motor.jaxexport"
     size = export_estimator(estimator, motor, path, 8192)

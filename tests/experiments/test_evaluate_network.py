@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -19,16 +18,9 @@ from kmn_jax.errors import InputError
 from kmn_jax.models import create_model, load_model, load_pretrained, save_model
 from tests.reference.networks import TINY
 
+pytestmark = pytest.mark.usefixtures("few_optimisations")
+
 ASSETS = Path(__file__).parent.parent.parent / "experiments" / "assets"
-
-
-@pytest.fixture(autouse=True, scope="module")
-def few_optimisations() -> Iterator[None]:
-    """Compile faster, which is most of the time here."""
-    before = jax.config.values["jax_disable_most_optimizations"]
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
 
 
 @pytest.fixture(scope="module")

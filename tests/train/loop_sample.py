@@ -17,6 +17,7 @@ from configs import find_config
 from kmn_jax.train import TrainConfig, create_state, read_metrics
 from kmn_jax.train._checkpoint import Checkpoints
 from kmn_jax.train._snapshot import Snapshot
+from tests.reference.compiled import with_devices
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -29,7 +30,7 @@ COMPILED = {
 }
 # The same for processes.
 ENVIRONMENT = {name.upper(): str(value) for name, value in COMPILED.items()} | {"JAX_PLATFORMS": "cpu"}
-ONE_DEVICE = "--xla_force_host_platform_device_count=1"
+ONE_DEVICE = with_devices(1)
 
 # What differs from the config "debug". None of `num_steps` to `checkpoint_every` is part of the compiled step. Of
 # symmetric objects rounding decides which points are the farthest, so keypoints are drawn.

@@ -20,6 +20,7 @@ import pytest
 from kmn_jax.errors import InputError
 from kmn_jax.train._checkpoint import Checkpoints
 from kmn_jax.train._step import TrainState
+from tests.reference.compiled import with_devices
 from tests.train.snapshot_sample import (
     DAMAGES,
     TINY,
@@ -345,7 +346,7 @@ checkpoints.save(replace(found, state=found.state._replace(step=found.state.step
 
 def test_other_number_of_devices(two: Path, tmp_path: Path, like: TrainState) -> None:
     folder = shutil.copytree(two, tmp_path / "checkpoints")
-    with run_python(EIGHT_DEVICES, folder, XLA_FLAGS="--xla_force_host_platform_device_count=8") as process:
+    with run_python(EIGHT_DEVICES, folder, XLA_FLAGS=with_devices(8)) as process:
         assert process.wait(timeout=240) == 0
     found = Checkpoints(folder).latest(like)
     wanted = random_snapshot(20, like)

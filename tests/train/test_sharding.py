@@ -17,6 +17,7 @@ from kmn_jax.errors import InputError
 from kmn_jax.train import data_mesh, initialize_distributed, read_metrics, split_cpu, train
 from kmn_jax.train._sharding import check_batch
 from kmn_jax.train._window import MEANS
+from tests.reference.compiled import with_devices
 from tests.train.loop_sample import ENVIRONMENT, ROOT, flags, newest, run_train, tiny
 from tests.train.sharded_run import SHARED, losses, squared_norm
 
@@ -52,7 +53,7 @@ def test_one_and_eight_devices_train_alike(one: dict[str, Any]) -> None:
     process = subprocess.run(
         [sys.executable, "-m", "tests.train.sharded_run"],
         cwd=ROOT,
-        env=os.environ | ENVIRONMENT | {"XLA_FLAGS": "--xla_force_host_platform_device_count=8"},
+        env=os.environ | ENVIRONMENT | {"XLA_FLAGS": with_devices(8)},
         capture_output=True,
         text=True,
         timeout=580,
