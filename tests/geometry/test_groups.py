@@ -37,7 +37,7 @@ def both(queries: jax.Array, points: jax.Array, mask: jax.Array, asked: jax.Arra
     return [real, asked_for, rows.reshape(-1), dense[asked_for], distance.reshape(-1), far[asked_for]]
 
 
-@pytest.mark.parametrize("counts", [(700, 900), (64, 33), (1, 1)])
+@pytest.mark.parametrize("counts", [(700, 900), (1, 33)])
 @pytest.mark.parametrize("name", ["surface", "volume", "lattice", "one place"])
 def test_neighbours_are_those_of_all_distances(name: str, counts: tuple[int, int]) -> None:
     keys = jax.random.split(jax.random.key(0), 4)
@@ -58,7 +58,7 @@ def test_neighbours_are_those_of_all_distances(name: str, counts: tuple[int, int
 
 def test_groups_hold_neighbours() -> None:
     points = box_surface(jax.random.key(1), 2048, 1.0)[0]
-    groups = group_points(points)
+    groups = jax.jit(group_points)(points)
     assert sorted(np.asarray(groups.rows).reshape(-1)) == list(range(2048))
     np.testing.assert_array_equal(groups.points, points[groups.rows])
     assert np.median(np.ptp(np.asarray(groups.points), axis=1).max(axis=1)) < 0.25

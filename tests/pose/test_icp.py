@@ -231,10 +231,9 @@ def test_many_points_end_where_all_distances_do(method, monkeypatch):
     poses, inliers = [], []
     for few in (2**20, 0):
         monkeypatch.setattr(_icp, "_FEW_DISTANCES", few)
-        run = jax.jit(_icp._icp.__wrapped__, static_argnums=8)
-        result = run(
-            model, scene, start, jnp.float32(DIAMETER), normals, object_mask, scene_mask, None, IcpConfig(method=method)
-        )
+        given = model, scene, start, jnp.float32(DIAMETER), normals, object_mask, scene_mask, None
+        # Of a new function each time: one that was traced before is not traced again.
+        result = jax.jit(lambda *given: _icp._icp.__wrapped__(*given, IcpConfig(method=method)))(*given)
         assert result.converged
         poses.append(np.asarray(result.T_scene_object))
         inliers.append(np.asarray(result.inlier_mask))
