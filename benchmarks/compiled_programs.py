@@ -17,8 +17,8 @@ from kmn_jax.data import Pack, SampleIndex, stack_pack
 from kmn_jax.detection import (
     EVIDENCE,
     BinPosesConfig,
+    CalibrationArrays,
     DepthImage,
-    DeviceCalibration,
     bin_poses,
     device_part,
     poses_in_crop,
@@ -33,6 +33,7 @@ _PACK = "experiments/assets/small_pack"
 _OBJECTS = 1507  # of the training pack, of which the small one has a few
 _CLOUD = 32_768  # points of a scan
 _IMAGE = (600, 972)  # pixels of the small test set's images
+_HIDDEN_UNITS = 8  # of the model of probabilities
 COMPUTES: tuple[Compute, ...] = ("float32", "tf32", "bfloat16")
 
 
@@ -126,7 +127,9 @@ def _bin(seeds: int) -> Program:
 
         number = _array((), jnp.float32)
         image = DepthImage(_array(_IMAGE, jnp.float32), Intrinsics(*[number] * 6))
-        calibration = DeviceCalibration(_array((len(EVIDENCE),), jnp.float32), number)
+        columns, units = _array((len(EVIDENCE),), jnp.float32), _array((_HIDDEN_UNITS,), jnp.float32)
+        hidden = _array((len(EVIDENCE), _HIDDEN_UNITS), jnp.float32)
+        calibration = CalibrationArrays(columns, columns, hidden, units, units, columns, number)
         inside, key = _array(_IMAGE, jnp.bool_), _array((2,), jnp.uint32)
         return jax.jit(solve), _on(devices, (model.parameters, part, calibration, image, inside, key))
 

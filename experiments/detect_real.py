@@ -20,8 +20,8 @@ import tyro
 from jaxtyping import Bool, Float
 
 from experiments.bins import THRESHOLD, TrueImage
-from kmn_jax import PoseEstimator
 from kmn_jax.bop import FrameKey
+from kmn_jax.detection import PoseEstimator
 from kmn_jax.errors import InputError
 from kmn_jax.io import Scan, read_scan
 from kmn_jax.report import check_target, print_table, write_json

@@ -13,9 +13,9 @@ import experiments
 from kmn_jax.detection import (
     BinPoses,
     BinPosesConfig,
+    CalibrationArrays,
     CropSearchConfig,
     DepthImage,
-    DeviceCalibration,
     DevicePart,
     PoseEstimator,
     SearchConfig,
@@ -29,7 +29,7 @@ from kmn_jax.pose import adi
 
 ASSETS = Path(experiments.__file__).parent / "assets"
 IMAGE = max((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))
-OnDevice = tuple[DevicePart, DeviceCalibration]
+OnDevice = tuple[DevicePart, CalibrationArrays]
 Seen = tuple[DepthImage, jax.Array, np.ndarray]
 CONFIG = BinPosesConfig(num_seeds=32, search=SearchConfig(CropSearchConfig(num_points=512)))
 FLOOR_MARGIN = 3.0  # mm

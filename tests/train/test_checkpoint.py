@@ -393,8 +393,7 @@ assert not reports
 
 
 def test_two_processes(tmp_path: Path, like: TrainState) -> None:
-    with socket.socket() as server:
-        server.bind(("localhost", 0))
+    with socket.create_server(("localhost", 0)) as server:
         port = server.getsockname()[1]
     with run_python(TWO_PROCESSES, port, 0, tmp_path) as first, run_python(TWO_PROCESSES, port, 1, tmp_path) as second:
         assert (first.wait(timeout=240), second.wait(timeout=240)) == (0, 0)
