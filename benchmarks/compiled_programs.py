@@ -94,7 +94,7 @@ def _crops(batch: int) -> Program:
     def make(devices: list[Any]) -> tuple[Any, tuple[Any, ...]]:
         model = load_pretrained("small")
         part = arrays_of(model, make_part(small_case()[0], model))
-        config = SEARCH.of_network(model.config)
+        config = replace(SEARCH.of_network(model.config), side_by_side=True)  # what a device would have it be
 
         def solve(parameters: nnx.State, part: Any, clouds: PaddedCloud, keys: jax.Array) -> Any:
             def one(cloud: PaddedCloud, key: jax.Array) -> Any:
@@ -118,7 +118,7 @@ def _bin(seeds: int) -> Program:
         model = load_pretrained("small")
         part = device_part(model, make_part(small_case()[0], model))
         search = BinPosesConfig().search
-        search = replace(search, crops=search.crops.of_network(model.config))
+        search = replace(search, crops=replace(search.crops.of_network(model.config), side_by_side=True))
         config = BinPosesConfig(num_seeds=seeds, search=search)
 
         def solve(parameters: nnx.State, part: Any, calibration: Any, image: Any, inside: Any, key: jax.Array) -> Any:

@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 
 from kmn_jax.typing import Scalar
 
-_AT_ONCE = 12  # on accelerators, where every round of a loop is a kernel to start; all at once compiles for long
 _SQUARINGS = 24  # 2**24 power iterations: eigenvalues closer than float32 can tell apart no longer matter
+_AT_ONCE = _SQUARINGS  # on accelerators, where every round of a loop is several kernels to start
 
 
 def dominant_eigenvector(matrix: Float[Array, "d d"]) -> Float[Array, " d"]:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from kmn_jax.geometry import (
+    _eigen,
     _selection,
     ask_for_fast_selection,
     dominant_eigenvector,
@@ -60,6 +61,7 @@ def test_both_forms_agree(function: Callable[[jax.Array], Any], points: jax.Arra
         return default(*arguments)
 
     monkeypatch.setattr(jax.lax, "platform_dependent", other_form)
+    monkeypatch.setattr(_eigen, "_AT_ONCE", 3)  # longer pieces take long to compile
     found = jax.jit(lambda x: function(x))(points)
     assert asked
     # Eigenvectors of 24 squarings agree to rounding of each.
