@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 import traceback
 from dataclasses import dataclass, replace
@@ -12,7 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from kmn_jax import __version__
 from kmn_jax.errors import InputError
+from kmn_jax.extras import missing_packages
 from kmn_jax.files import check_output
 
 if TYPE_CHECKING:
@@ -293,6 +296,9 @@ def _keep_compiled() -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line: 0 is success, 2 bad input (one sentence on stderr), 1 our own failure."""
     arguments = _joined(sys.argv[1:] if arguments is None else arguments)
+    if arguments == ["--version"]:
+        print(f"kmn {__version__}")
+        return 0
     commands: dict[str, Any] = {call.__name__: call for call in (prepare, detect, view, export, convert)}
     try:
         _keep_compiled()
@@ -304,7 +310,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"kmn: {error}", file=sys.stderr)
         return 2
     except ModuleNotFoundError as error:
-        print(f"kmn: this needs the package {error.name}: pip install 'kmn_jax[all]'", file=sys.stderr)
+        wanted = " ".join(shlex.quote(package) for package in missing_packages(error.name or "kmn_jax"))
+        print(f"kmn: this needs packages that are not installed: pip install {wanted}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130

@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 ROOMS = ("geometry", "models", "pose", "io", "objects", "simulate", "bop", "data", "train", "detection", "viz", "cli")
-RANKS = dict.fromkeys(("typing", "errors", "units", "files", "report"), 0) | {
+RANKS = dict.fromkeys(("typing", "errors", "units", "extras", "files", "report"), 0) | {
     name: rank for rank, name in enumerate(ROOMS, start=1)
 }
 # Pairs of neighbours that the ranks alone would allow: the pose solver takes arrays, not models.
