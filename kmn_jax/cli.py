@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from kmn_jax.detection import Detections
     from kmn_jax.objects import Part
+    from kmn_jax.units import Unit
 
 Units = Literal["auto", "mm", "cm", "m", "in"]
 
@@ -58,6 +59,9 @@ class Request:
     """Search on where nothing was found: takes longer in full bins, and finds a few copies more."""
     sensor: str | None = None
     """X,Y,Z of the sensor in the scene's frame; the origin unless given."""
+    base_camera: Path | None = None
+    """JSON with T_base_camera (4 x 4), or xyz and the quaternion xyzw, and perhaps unit, else the scene's: the camera's
+    pose in the robot's frame, in which poses are then told, too."""
     weights: str = "small"
     """Released network, or a .safetensors file."""
 
@@ -210,6 +214,7 @@ class _Session:
 
     def __init__(self, request: Request) -> None:
         from kmn_jax.detection import THOROUGH, Clock, ForegroundOptions, OrientedBox, PoseEstimator
+        from kmn_jax.io import read_pose
 
         places = [_numbers(text, "--at", 3) for text in request.at]
         region: Any = None if request.roi is None else tuple(_numbers(request.roi, "--roi", 6, 9))
@@ -217,6 +222,9 @@ class _Session:
             region = OrientedBox.of_numbers(region)
         sensor = None if request.sensor is None else np.array(_numbers(request.sensor, "--sensor", 3))
         self.places = np.array(places) if places else None
+        self._base = None if request.base_camera is None else read_pose(request.base_camera, "T_base_camera")
+        if self._base is not None and sensor is not None:
+            raise InputError("--base-camera is for scans in the camera's frame: leave --sensor out")
         self._request, self._clock = request, Clock()
         with self._clock("part"):
             self.estimator = PoseEstimator.from_pretrained(request.weights, THOROUGH if request.thorough else None)
@@ -238,14 +246,19 @@ class _Session:
     def detect(self, places: Float[np.ndarray, "k 3"] | None) -> Detections:
         """Search the scan, or places of it only."""
         from kmn_jax.detection import Clock
+        from kmn_jax.io import in_other_unit
 
         clock, self._clock = self._clock, Clock()
+        base = None
+        if self._base is not None:
+            pose, unit = self._base
+            base = in_other_unit(pose, unit or self.scene.unit, self.scene.unit)
         return self.estimator.detect(
-            self.part, self.scene, at=places, random_seed=self._request.random_seed, clock=clock
+            self.part, self.scene, at=places, T_base_camera=base, random_seed=self._request.random_seed, clock=clock
         )
 
 
-def _unit(units: Units) -> str | None:
+def _unit(units: Units) -> Unit | None:
     return None if units == "auto" else units
 
 

@@ -42,6 +42,9 @@ def test_a_bin_in_all_forms_of_output(card: Path, tmp_path: Path, capsys: pytest
     outputs = {flag: tmp_path / name for flag, name in (("--json", "a.json"), ("--bop-csv", "a.csv"))}
     picture = tmp_path / "a.png"
     arguments = [str(part) for pair in outputs.items() for part in pair]
+    base = tmp_path / "base.json"
+    base.write_text(json.dumps({"xyz": [0.5, 0, 1], "xyzw": [1, 0, 0, 0], "unit": "m"}))
+    arguments += ["--base-camera", str(base)]
     code = main(
         [
             "detect",
@@ -66,6 +69,12 @@ def test_a_bin_in_all_forms_of_output(card: Path, tmp_path: Path, capsys: pytest
     assert {"T_scene_object", "probability", "inliers", "visible_fraction", "runner_up_gap", "warnings"} <= found[
         "poses"
     ][0].keys()
+    for pose in found["poses"]:
+        assert pose["num_inliers"] == pose["inliers"]
+        T_base_camera = np.diag([1.0, -1, -1, 1])
+        T_base_camera[:3, 3] = 500, 0, 1000
+        np.testing.assert_allclose(pose["T_base_object"], T_base_camera @ pose["T_scene_object"], atol=1e-9)
+    assert "in the robot's frame" in said.out
     rows = table(outputs["--bop-csv"])
     assert [float(row["score"]) for row in rows] == [pose["probability"] for pose in found["poses"]]
     assert (rows[0]["scene_id"], rows[0]["im_id"], rows[0]["obj_id"]) == ("2", str(int(IMAGE.stem)), "2")
@@ -123,6 +132,7 @@ def test_bad_input_is_one_sentence_and_exit_2(
     (tmp_path / "renamed.ply").write_bytes(MOTOR.read_bytes())
     (tmp_path / "nothing.stl").write_text("solid a\nendsolid a\n")
     (tmp_path / "camera.json").write_text("{")
+    (tmp_path / "base.json").write_text(json.dumps(np.eye(4).tolist()))
     np.save(tmp_path / "nan.npy", np.full((10, 3), np.nan, np.float32))
     np.save(tmp_path / "metres.npy", np.load(cloud) / 1000)
     np.save(tmp_path / "depth.npy", np.ones((40, 50), np.float32))
@@ -149,6 +159,9 @@ def test_bad_input_is_one_sentence_and_exit_2(
         ({"--json": str(tmp_path / "missing" / "a.json")}, "folder does not exist"),
         ({"--json": str(cloud)}, "it is read, too"),
         ({"--weights": "large"}, "no released model"),
+        ({"--base-camera": str(tmp_path / "none.json")}, "none.json"),
+        ({"--base-camera": str(tmp_path / "camera.json")}, "cannot be used as a pose"),
+        ({"--base-camera": str(tmp_path / "base.json"), "--sensor": "0,0,0"}, "leave --sensor out"),
     ]
     for changes, message in cases:
         arguments = [part for pair in (whole | changes).items() for part in pair]

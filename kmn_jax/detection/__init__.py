@@ -38,7 +38,7 @@ from kmn_jax.detection._depth_agreement import (
 )
 from kmn_jax.detection._detect import THOROUGH, DetectConfig, chosen, detect, detections, explore, refined_candidates
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place, symmetry_transforms
-from kmn_jax.detection._estimator import PartSource, PoseEstimator, ScanSource
+from kmn_jax.detection._estimator import PoseEstimator
 from kmn_jax.detection._evidence import EVIDENCE, SIGNS, gather_evidence
 from kmn_jax.detection._export import export_estimator
 from kmn_jax.detection._foreground import ForegroundOptions, OrientedBox, foreground
@@ -46,7 +46,7 @@ from kmn_jax.detection._frames import into, placed
 from kmn_jax.detection._mapping import call_rows, map_real, map_rows
 from kmn_jax.detection._outline import OutlineAgreement, outline_agreement
 from kmn_jax.detection._output import as_json, table, write_bop_csv, write_json
-from kmn_jax.detection._result import CropPrediction, Detection, Detections, Timing
+from kmn_jax.detection._result import CropPrediction, Detection, Detections, Pick, Timing
 from kmn_jax.detection._scene import MOST_POINTS, Scene, make_scene
 from kmn_jax.detection._search import (
     Candidates,
@@ -61,6 +61,7 @@ from kmn_jax.detection._search import (
 )
 from kmn_jax.detection._seeds import NUM_SEEDS, seeds_at, seeds_over, spread_seeds
 from kmn_jax.detection._selection import Selection, select, select_poses
+from kmn_jax.detection._sources import MeshLike, PartSource, ScanSource
 from kmn_jax.detection._timing import Clock
 
 __all__ = [
@@ -89,9 +90,11 @@ __all__ = [
     "Draw",
     "DrawsSearch",
     "ForegroundOptions",
+    "MeshLike",
     "OrientedBox",
     "OutlineAgreement",
     "PartSource",
+    "Pick",
     "PoseEstimator",
     "Prediction",
     "Probabilities",

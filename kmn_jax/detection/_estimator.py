@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeAlias, overload
+from typing import Literal, overload
 
 import numpy as np
 from jaxtyping import Float
@@ -14,13 +14,24 @@ from kmn_jax.bop import bop_scan, bop_scene_id, bop_sizes, is_bop_image
 from kmn_jax.detection._calibration import Probabilities, load_probabilities
 from kmn_jax.detection._detect import DetectConfig, detect
 from kmn_jax.detection._evidence import EVIDENCE
+from kmn_jax.detection._exclusion import apart
 from kmn_jax.detection._foreground import ForegroundOptions
 from kmn_jax.detection._frames import into
 from kmn_jax.detection._result import Detections
+from kmn_jax.detection._scan_frame import base_from_scene, in_base, scan_frame
 from kmn_jax.detection._scene import Scene, make_scene, nearest_row
+from kmn_jax.detection._sources import PartSource, ScanSource, arranged
 from kmn_jax.detection._timing import Clock
 from kmn_jax.errors import InputError, float_array
-from kmn_jax.io import Scan, length_doubt, length_problem, read_scan, resolve_unit, scene_size
+from kmn_jax.io import (
+    CameraMatrix,
+    Scan,
+    length_doubt,
+    length_problem,
+    read_scan,
+    resolve_unit,
+    scene_size,
+)
 from kmn_jax.models import Model, load_model, released_file
 from kmn_jax.objects import (
     ObjectConfig,
@@ -33,10 +44,8 @@ from kmn_jax.objects import (
     object_from_cloud,
     object_from_mesh,
 )
-from kmn_jax.units import check_unit
-
-PartSource: TypeAlias = Any  # see PoseEstimator.prepare
-ScanSource: TypeAlias = str | Path | np.ndarray | Scan
+from kmn_jax.typing import ArrayInput
+from kmn_jax.units import Unit, check_unit
 
 _UNFITTED = "the probabilities were fitted for other weights: fit them with experiments.calibrate"
 _NUM_POINTS = 4096  # on a part's surface
@@ -54,6 +63,7 @@ class PoseEstimator:
     probabilities: Probabilities
     config: DetectConfig = field(default_factory=DetectConfig)
     warnings: tuple[str, ...] = ()  # go with every result
+    weights: str | None = None  # the name or file that the model was loaded by
 
     @classmethod
     def from_pretrained(cls, weights: str | Path = "small", config: DetectConfig | None = None) -> PoseEstimator:
@@ -69,9 +79,10 @@ class PoseEstimator:
         probabilities = load_probabilities(
             fitted if own else released_file("small").with_suffix(".calibration.json"), EVIDENCE
         )
-        return cls(model, model_digest(model), probabilities, config or DetectConfig(), () if own else (_UNFITTED,))
+        warnings = () if own else (_UNFITTED,)
+        return cls(model, model_digest(model), probabilities, config or DetectConfig(), warnings, str(weights))
 
-    def prepare(self, source: PartSource, unit: str | None = None, name: str | None = None) -> Part:
+    def prepare(self, source: PartSource, unit: Unit | None = None, name: str | None = None) -> Part:
         """Make a part of a CAD file, a cloud that covers the whole surface, a mesh or an object card.
 
         `source` is a path (STL, OBJ, PLY, GLB, STEP, PCD, XYZ, or .kmn, a card), an array (n, 3) or (n, 6) of points
@@ -94,9 +105,12 @@ class PoseEstimator:
         scan: ScanSource,
         part: Part | Sequence[Part],
         *,
-        unit: str | None = None,
+        unit: Unit | Literal["auto"] | None = None,
         camera: str | Path | None = None,
+        K: CameraMatrix | None = None,
+        depth_unit: Unit | float | None = None,
         sensor: Float[np.ndarray, "3"] | None = None,
+        T_scene_camera: ArrayInput | None = None,
         at: Float[np.ndarray, "*k 3"] | None = None,
         background: ForegroundOptions | None = None,
     ) -> Scene:
@@ -108,7 +122,8 @@ class PoseEstimator:
         if not parts:
             raise InputError("no object is given to make the scene for")
         smallest, ratio = parts[0], parts[-1].in_unit("m").diameter / parts[0].in_unit("m").diameter
-        read, truth, bop_ids = _read(scan, unit, camera, smallest)
+        read, truth, bop_ids = _read(arranged(scan, K, depth_unit, camera, unit), unit, camera, smallest)
+        frame = scan_frame(read, sensor, T_scene_camera)
         size = scene_size(read)
         problem = length_problem(smallest.diameter, smallest.unit, size)
         if problem is not None:
@@ -117,18 +132,30 @@ class PoseEstimator:
         # Margins are those of the smallest part, but a plane is background only if it is no part's.
         options = replace(options, least_extent=options.least_extent * ratio)
         diameter = smallest.in_unit(read.unit).diameter
-        scene = make_scene(read, diameter, sensor=sensor, background=options, keep=_places(at))
+        scene = make_scene(read, diameter, sensor=frame.sensor, background=options, keep=_places(at))
         return replace(
             scene,
-            warnings=(*self.warnings, *scene.warnings),
+            warnings=(*self.warnings, *frame.warnings, *scene.warnings),
             doubt=length_doubt(smallest.diameter, smallest.unit, size),
             truth=truth,
             bop_ids=bop_ids,
+            T_scene_sensor=frame.T_scene_sensor,
+            is_opengl=frame.is_opengl,
+            source=str(scan) if isinstance(scan, str | Path) else None,
         )
 
-    def read(self, scan: ScanSource, part: Part, unit: str | None = None, camera: str | Path | None = None) -> Scan:
+    def read(
+        self,
+        scan: ScanSource,
+        part: Part,
+        unit: Unit | Literal["auto"] | None = None,
+        camera: str | Path | None = None,
+        *,
+        K: CameraMatrix | None = None,
+        depth_unit: Unit | float | None = None,
+    ) -> Scan:
         """Read a scan as `scene` does, such as that of an empty bin."""
-        return _read(scan, unit, camera, part)[0]
+        return _read(arranged(scan, K, depth_unit, camera, unit), unit, camera, part)[0]
 
     @overload
     def detect(
@@ -136,10 +163,14 @@ class PoseEstimator:
         part: Part,
         scan: ScanSource | Scene,
         camera: str | Path | None = None,
-        unit: str | None = None,
+        unit: Unit | Literal["auto"] | None = None,
         at: Float[np.ndarray, "*k 3"] | None = None,
         *,
+        K: CameraMatrix | None = None,
+        depth_unit: Unit | float | None = None,
         sensor: Float[np.ndarray, "3"] | None = None,
+        T_scene_camera: ArrayInput | None = None,
+        T_base_camera: ArrayInput | None = None,
         background: ForegroundOptions | None = None,
         random_seed: int = 0,
         top: int | None = None,
@@ -152,10 +183,14 @@ class PoseEstimator:
         part: Sequence[Part],
         scan: ScanSource | Scene,
         camera: str | Path | None = None,
-        unit: str | None = None,
+        unit: Unit | Literal["auto"] | None = None,
         at: Float[np.ndarray, "*k 3"] | None = None,
         *,
+        K: CameraMatrix | None = None,
+        depth_unit: Unit | float | None = None,
         sensor: Float[np.ndarray, "3"] | None = None,
+        T_scene_camera: ArrayInput | None = None,
+        T_base_camera: ArrayInput | None = None,
         background: ForegroundOptions | None = None,
         random_seed: int = 0,
         top: int | None = None,
@@ -167,10 +202,14 @@ class PoseEstimator:
         part: Part | Sequence[Part],
         scan: ScanSource | Scene,
         camera: str | Path | None = None,
-        unit: str | None = None,
+        unit: Unit | Literal["auto"] | None = None,
         at: Float[np.ndarray, "*k 3"] | None = None,
         *,
+        K: CameraMatrix | None = None,
+        depth_unit: Unit | float | None = None,
         sensor: Float[np.ndarray, "3"] | None = None,
+        T_scene_camera: ArrayInput | None = None,
+        T_base_camera: ArrayInput | None = None,
         background: ForegroundOptions | None = None,
         random_seed: int = 0,
         top: int | None = None,
@@ -178,12 +217,18 @@ class PoseEstimator:
     ) -> Detections | tuple[Detections, ...]:
         """Return the copies of a part in a scan, in pick order; of several parts, one result for each.
 
-        `scan` is a file, points (n, 3) in the sensor's frame, a `Scan`, or a `Scene` that was made of one; then what
-        says how to read it is not given again. `unit` is that of its lengths, by default what its format states, else
-        the part's; an image of a BOP dataset needs neither it nor a camera. `at` restricts the search to places (k, 3)
-        in the scan's frame: each has one pose or none. `sensor` is where the scan was measured from, by default the
-        origin of its frame; `background` says what is no part; `top` keeps the first poses only; `clock` has timed what
-        came before. The same inputs and `random_seed` give the same bits on one device.
+        `scan` is a file, points (n, 3) or (h, w, 3), a depth image (h, w) with `K`, a `Scan`, or a `Scene` that was
+        made of one; then what says how to read it is not given again. Points are in the camera's frame, unless
+        `T_scene_camera` is its pose in theirs, z forward, or `sensor` its place. `K` are intrinsics (3, 3), or fx, fy,
+        cx, cy, and `depth_unit` is the unit of a depth image and of its result: mm of whole numbers and m of fractions
+        unless given, or how many metres one step is. `unit` is that of all other scans' lengths, by default what the
+        format states, else the part's; an image of a BOP dataset needs neither it nor `camera`, a file of intrinsics.
+
+        `T_base_camera`, in the result's unit, is the camera's pose in a robot's frame: each copy then has a
+        `T_base_object`. `at` restricts the search to places (k, 3) in the scan's frame: each has one pose or none.
+        `background` says what is no part; `top` keeps the first poses only; `clock` has timed what came before. Where
+        poses of several parts would stand in one place, the more probable one stays. The same inputs and `random_seed`
+        give the same bits on one device.
 
         Raises InputError if lengths of part and scan cannot belong together, if nothing of the scan is foreground, or
         if nothing was measured near to one of the places.
@@ -201,31 +246,43 @@ class PoseEstimator:
         clock = clock or Clock()
         places = _places(at)
         if isinstance(scan, Scene):
-            if (camera, unit, sensor, background) != (None, None, None, None):
-                raise InputError("camera, unit, sensor and background were settled when the scene was made")
+            given = (camera, unit, K, depth_unit, sensor, T_scene_camera, background)
+            if any(value is not None for value in given):
+                raise InputError(
+                    "camera, unit, K, depth_unit, sensor, T_scene_camera and background were settled when the scene was"
+                    " made"
+                )
             scene = scan
         else:
             with clock("scene"):
                 scene = self.scene(
-                    scan, parts, unit=unit, camera=camera, sensor=sensor, at=places, background=background
+                    scan,
+                    parts,
+                    unit=unit,
+                    camera=camera,
+                    K=K,
+                    depth_unit=depth_unit,
+                    sensor=sensor,
+                    T_scene_camera=T_scene_camera,
+                    at=places,
+                    background=background,
                 )
+        T_base_scene = base_from_scene(T_base_camera, scene.T_scene_sensor, scene.is_opengl)
+        parts = [one.in_unit(scene.unit) for one in parts]
         if places is not None:
             places = into(scene.T_scene_camera, places)
-            _check_near(scene, places, max(one.in_unit(scene.unit).diameter for one in parts))
+            _check_near(scene, places, max(one.diameter for one in parts))
+        settings = {"scene": scene.source, "seed": random_seed, "weights": self.weights, "model": self.digest}
         results = []
         for one in parts:
-            found = detect(
-                self.model,
-                self.probabilities,
-                one.in_unit(scene.unit),
-                scene,
-                random_seed,
-                self.config,
-                places,
-                clock,
-            )
-            results.append(replace(found, poses=found.poses[:top]))
+            found = detect(self.model, self.probabilities, one, scene, random_seed, self.config, places, clock)
+            results.append(replace(found, settings=settings))
             clock = Clock()
+        if len(parts) > 1:
+            results = list(apart(results, parts))
+        for number, found in enumerate(results):
+            found = replace(found, poses=found.poses[:top])
+            results[number] = found if T_base_scene is None else in_base(found, T_base_scene)
         return results[0] if isinstance(part, Part) else tuple(results)
 
 
@@ -279,7 +336,7 @@ def _object(source: PartSource, unit: str | None, name: str | None) -> ObjectMod
         return load_object(source, unit, config)
     unit, name = check_unit(unit or "mm"), name or "part"
     if not isinstance(source, np.ndarray):
-        if hasattr(source, "vertices") and hasattr(source, "faces"):
+        if not isinstance(source, tuple) and hasattr(source, "vertices") and hasattr(source, "faces"):
             source = (source.vertices, source.faces)
         if not isinstance(source, tuple) or len(source) != 2:
             raise InputError(f"an object cannot be made of a {type(source).__name__}: give a file, a cloud or a mesh")
