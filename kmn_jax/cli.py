@@ -62,6 +62,8 @@ class Request:
     base_camera: Path | None = None
     """JSON with T_base_camera (4 x 4), or xyz and the quaternion xyzw, and perhaps unit, else the scene's: the camera's
     pose in the robot's frame, in which poses are then told, too."""
+    grasps: Path | None = None
+    """File of the object's grasps, see docs/grasps.md: poses then carry those that are free."""
     weights: str = "small"
     """Released network, or a .safetensors file."""
 
@@ -112,7 +114,8 @@ def detect(
         raise InputError(f"top is {top}, but must be at least 1")
     for target in (json, bop_csv, save_picture):
         if target is not None:
-            check_output(target, request.object, request.scene, request.camera, request.background)
+            read = (request.camera, request.background, request.base_camera, request.grasps)
+            check_output(target, request.object, request.scene, *read)
     if save_picture is not None:
         from kmn_jax.viz import check_picture
 
@@ -215,6 +218,7 @@ class _Session:
     def __init__(self, request: Request) -> None:
         from kmn_jax.detection import THOROUGH, Clock, ForegroundOptions, OrientedBox, PoseEstimator
         from kmn_jax.io import read_pose
+        from kmn_jax.objects import load_grasps
 
         places = [_numbers(text, "--at", 3) for text in request.at]
         region: Any = None if request.roi is None else tuple(_numbers(request.roi, "--roi", 6, 9))
@@ -225,6 +229,7 @@ class _Session:
         self._base = None if request.base_camera is None else read_pose(request.base_camera, "T_base_camera")
         if self._base is not None and sensor is not None:
             raise InputError("--base-camera is for scans in the camera's frame: leave --sensor out")
+        self._grasps = None if request.grasps is None else load_grasps(request.grasps)
         self._request, self._clock = request, Clock()
         with self._clock("part"):
             self.estimator = PoseEstimator.from_pretrained(request.weights, THOROUGH if request.thorough else None)
@@ -254,7 +259,13 @@ class _Session:
             pose, unit = self._base
             base = in_other_unit(pose, unit or self.scene.unit, self.scene.unit)
         return self.estimator.detect(
-            self.part, self.scene, at=places, T_base_camera=base, random_seed=self._request.random_seed, clock=clock
+            self.part,
+            self.scene,
+            at=places,
+            T_base_camera=base,
+            grasps=self._grasps,
+            random_seed=self._request.random_seed,
+            clock=clock,
         )
 
 

@@ -43,6 +43,7 @@ from kmn_jax.detection._evidence import EVIDENCE, SIGNS, gather_evidence
 from kmn_jax.detection._export import export_estimator
 from kmn_jax.detection._foreground import ForegroundOptions, OrientedBox, foreground
 from kmn_jax.detection._frames import into, placed
+from kmn_jax.detection._grasps import Conflict, Copy, grasp_conflict, with_grasps
 from kmn_jax.detection._mapping import call_rows, map_real, map_rows
 from kmn_jax.detection._outline import OutlineAgreement, outline_agreement
 from kmn_jax.detection._output import as_json, table, write_bop_csv, write_json
@@ -61,7 +62,7 @@ from kmn_jax.detection._search import (
 )
 from kmn_jax.detection._seeds import NUM_SEEDS, seeds_at, seeds_over, spread_seeds
 from kmn_jax.detection._selection import Selection, select, select_poses
-from kmn_jax.detection._sources import MeshLike, PartSource, ScanSource
+from kmn_jax.detection._sources import GraspSource, MeshLike, PartSource, ScanSource
 from kmn_jax.detection._timing import Clock
 
 __all__ = [
@@ -76,6 +77,8 @@ __all__ = [
     "Calibration",
     "Candidates",
     "Clock",
+    "Conflict",
+    "Copy",
     "CropPoses",
     "CropPrediction",
     "CropSearchConfig",
@@ -90,6 +93,7 @@ __all__ = [
     "Draw",
     "DrawsSearch",
     "ForegroundOptions",
+    "GraspSource",
     "MeshLike",
     "OrientedBox",
     "OutlineAgreement",
@@ -125,6 +129,7 @@ __all__ = [
     "fit_calibration",
     "foreground",
     "gather_evidence",
+    "grasp_conflict",
     "in_front_of_empty",
     "inside_bin",
     "into",
@@ -159,6 +164,7 @@ __all__ = [
     "surface_scores",
     "symmetry_transforms",
     "table",
+    "with_grasps",
     "write_bop_csv",
     "write_json",
 ]

@@ -17,10 +17,11 @@ from kmn_jax.detection._evidence import EVIDENCE
 from kmn_jax.detection._exclusion import apart
 from kmn_jax.detection._foreground import ForegroundOptions
 from kmn_jax.detection._frames import into
+from kmn_jax.detection._grasps import with_grasps
 from kmn_jax.detection._result import Detections
 from kmn_jax.detection._scan_frame import base_from_scene, in_base, scan_frame
 from kmn_jax.detection._scene import Scene, make_scene, nearest_row
-from kmn_jax.detection._sources import PartSource, ScanSource, arranged
+from kmn_jax.detection._sources import GraspSource, PartSource, ScanSource, arranged, grasps_of
 from kmn_jax.detection._timing import Clock
 from kmn_jax.errors import InputError, float_array
 from kmn_jax.io import (
@@ -142,6 +143,7 @@ class PoseEstimator:
             T_scene_sensor=frame.T_scene_sensor,
             is_opengl=frame.is_opengl,
             source=str(scan) if isinstance(scan, str | Path) else None,
+            empty=None if options.background is None else _points_of(options.background, scene),
         )
 
     def read(
@@ -171,6 +173,7 @@ class PoseEstimator:
         sensor: Float[np.ndarray, "3"] | None = None,
         T_scene_camera: ArrayInput | None = None,
         T_base_camera: ArrayInput | None = None,
+        grasps: GraspSource | Sequence[GraspSource | None] | None = None,
         background: ForegroundOptions | None = None,
         random_seed: int = 0,
         top: int | None = None,
@@ -191,6 +194,7 @@ class PoseEstimator:
         sensor: Float[np.ndarray, "3"] | None = None,
         T_scene_camera: ArrayInput | None = None,
         T_base_camera: ArrayInput | None = None,
+        grasps: GraspSource | Sequence[GraspSource | None] | None = None,
         background: ForegroundOptions | None = None,
         random_seed: int = 0,
         top: int | None = None,
@@ -210,6 +214,7 @@ class PoseEstimator:
         sensor: Float[np.ndarray, "3"] | None = None,
         T_scene_camera: ArrayInput | None = None,
         T_base_camera: ArrayInput | None = None,
+        grasps: GraspSource | Sequence[GraspSource | None] | None = None,
         background: ForegroundOptions | None = None,
         random_seed: int = 0,
         top: int | None = None,
@@ -225,7 +230,8 @@ class PoseEstimator:
         format states, else the part's; an image of a BOP dataset needs neither it nor `camera`, a file of intrinsics.
 
         `T_base_camera`, in the result's unit, is the camera's pose in a robot's frame: each copy then has a
-        `T_base_object`. `at` restricts the search to places (k, 3) in the scan's frame: each has one pose or none.
+        `T_base_object`. `grasps`, a file or one for each part, gives each copy those of them that are free (see
+        docs/grasps.md). `at` restricts the search to places (k, 3) in the scan's frame: each has one pose or none.
         `background` says what is no part; `top` keeps the first poses only; `clock` has timed what came before. Where
         poses of several parts would stand in one place, the more probable one stays. The same inputs and `random_seed`
         give the same bits on one device.
@@ -244,7 +250,7 @@ class PoseEstimator:
         if not 0 <= random_seed <= _MOST_SEED:
             raise InputError(f"random_seed is {random_seed}, but must be between 0 and {_MOST_SEED}")
         clock = clock or Clock()
-        places = _places(at)
+        places, ways = _places(at), grasps_of(grasps, len(parts))
         if isinstance(scan, Scene):
             given = (camera, unit, K, depth_unit, sensor, T_scene_camera, background)
             if any(value is not None for value in given):
@@ -282,8 +288,18 @@ class PoseEstimator:
             results = list(apart(results, parts))
         for number, found in enumerate(results):
             found = replace(found, poses=found.poses[:top])
+            way, clock = ways[number], Clock()
+            if way is not None:
+                with clock("grasps"):
+                    found = with_grasps(found, way, parts[number], scene, T_base_scene)
+                found = replace(found, timing=found.timing.and_then(clock.timing))
             results[number] = found if T_base_scene is None else in_base(found, T_base_scene)
         return results[0] if isinstance(part, Part) else tuple(results)
+
+
+def _points_of(empty: Scan, scene: Scene) -> Float[np.ndarray, "e 3"]:
+    """Return the points of an empty bin in the camera's frame and the scene's unit."""
+    return into(scene.T_scene_camera, empty.in_unit(scene.unit).points).astype(np.float32)
 
 
 def _places(at: Float[np.ndarray, "*k 3"] | None) -> Float[np.ndarray, "k 3"] | None:

@@ -47,7 +47,10 @@ def table(found: Detections, accepted: float) -> str:
         doubtful = f"{len(found.poses) - likely} doubtful"
         lines.append(f"{found.part}: {likely} found, {doubtful} (lengths in {found.unit}{frame})")
         rows = [_COLUMNS, *(_row(rank, pose) for rank, pose in enumerate(found.poses, start=1))]
-        widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
+        if found.poses[0].grasps is not None:
+            last = ("grasps", *(str(len(pose.grasps or ())) for pose in found.poses))
+            rows = [(*row, cell) for row, cell in zip(rows, last, strict=True)]
+        widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
         lines += ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
         lines += sorted({f"note: {warning}" for pose in found.poses for warning in pose.warnings})
     else:

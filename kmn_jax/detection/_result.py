@@ -103,6 +103,10 @@ class Timing:
         """Seconds in all."""
         return self.compile + sum(self.stages.values())
 
+    def and_then(self, later: Timing) -> Timing:
+        """Return both together."""
+        return Timing({**self.stages, **later.stages}, self.compile + later.compile)
+
 
 @dataclass(frozen=True, repr=False)
 class Detections:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from kmn_jax.errors import InputError
 from kmn_jax.io import CameraMatrix, Scan, depth_array_scan
+from kmn_jax.objects import Grasps, load_grasps
 from kmn_jax.typing import ArrayInput
 
 
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 else:
     PartSource = Any
 ScanSource: TypeAlias = str | Path | np.ndarray | Scan
+GraspSource: TypeAlias = str | Path | Grasps
 
 
 def arranged(
@@ -51,3 +54,15 @@ def arranged(
     if camera is not None or unit is not None:
         raise InputError("K and depth_unit say all that camera and unit would: leave these out")
     return depth_array_scan(scan, K, depth_unit)
+
+
+def grasps_of(given: GraspSource | Sequence[GraspSource | None] | None, count: int) -> list[Grasps | None]:
+    """Return the grasps of each of several parts. Raises InputError if they are not as many as the parts."""
+    if given is None:
+        return [None] * count
+    each = [given] if isinstance(given, str | Path | Grasps) else list(given)
+    if len(each) != count:
+        raise InputError(
+            f"grasps are given for {len(each)} parts, but there are {count}: give a file, or none, for each"
+        )
+    return [load_grasps(one) if isinstance(one, str | Path) else one for one in each]

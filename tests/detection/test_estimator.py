@@ -139,7 +139,8 @@ def test_a_driver_s_array_and_the_robot_s_frame(estimator: PoseEstimator, motor:
     scan, truth = bin_of(0)
     assert scan.depth is not None
     assert scan.camera is not None
-    seed = scan.points[len(scan.points) // 2]
+    top = truth[truth[:, 2, 3].argmin(), :3, 3]
+    seed = scan.points[np.linalg.norm(scan.points - top, axis=1).argmin()]
     known = {"at": seed / 1000, "T_base_camera": placed((0.3, 0, 1.2), random_rotations(1, 4)[0])}
     given = estimator.detect(motor, (scan.depth / 1000).astype(np.float32), K=scan.camera.matrix, **known)
     assert given.unit == "m"
