@@ -45,7 +45,8 @@ class Request:
     units: Units = "auto"
     """Unit of the scene's lengths; auto: that of the object, or what the format says."""
     object_units: Units = "auto"
-    """Unit of the object's lengths; auto: what the format says, else millimetres."""
+    """Unit of the object's numbers; auto: what the format says, else millimetres. Cards, STEP and GLB files state
+    theirs, and are converted."""
     random_seed: int = 0
     """Number that all randomness starts from: the same inputs and number give the same poses."""
     background: Path | None = None
@@ -79,10 +80,12 @@ def prepare(
     Args:
         source: CAD file (STL, OBJ, PLY, GLB, STEP) or cloud of the whole surface (PLY, PCD, XYZ).
         output: the card; by default beside the source, ending in .kmn.
-        units: unit of the source's lengths; auto: what the format says, else millimetres.
+        units: unit of the source's numbers; auto: what the format says, else millimetres. STEP and GLB files state
+            theirs: of them it is the unit that the card will be in.
         weights: released network, or a .safetensors file.
     """
     from kmn_jax.detection import PoseEstimator
+    from kmn_jax.io import size_question
     from kmn_jax.objects import save_part
 
     target = output or source.parent / f"{source.stem}.kmn"
@@ -90,6 +93,9 @@ def prepare(
     part = PoseEstimator.from_pretrained(weights).prepare(source, _unit(units))
     save_part(part, target)
     print(f"{part.name}: {_size(part)}, {_symmetry(part)}; wrote {target}")
+    question = size_question(part.diameter, part.unit, "--units")
+    if question is not None:
+        print(f"note: {question}")
 
 
 def detect(
@@ -168,6 +174,7 @@ def export(
     object: Path,
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     units: Units = "auto",
+    object_units: Units = "auto",
     points: int = 65_536,
     weights: str = "small",
 ) -> None:
@@ -176,7 +183,8 @@ def export(
     Args:
         object: CAD file, cloud of the whole surface, or object card (.kmn).
         output: the artefact; docs/detect.md tells how to call it.
-        units: unit of the object's lengths and of the scans that the artefact will be given; auto: the object's own.
+        units: unit of the scans that the artefact will be given, and of its poses; auto: that of the object.
+        object_units: unit of the object's numbers, as in kmn detect.
         points: how many points its scans hold at most.
         weights: released network, or a .safetensors file.
     """
@@ -184,7 +192,8 @@ def export(
 
     check_output(output, object)
     estimator = PoseEstimator.from_pretrained(weights)
-    part = estimator.prepare(object, _unit(units))
+    part = estimator.prepare(object, _unit(object_units))
+    part = part.in_unit(_unit(units) or part.unit)
     size = export_estimator(estimator, part, output, points)
     print(f"wrote {output}: {size / 1e6:.1f} MB, scans of up to {points} points in {part.unit}")
 

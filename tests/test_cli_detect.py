@@ -13,9 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from kmn_jax.bop import bop_scan
 from kmn_jax.cli import main
+from kmn_jax.objects import Part
 
 ASSETS = Path(__file__).parent.parent / "experiments" / "assets"
 IMAGE = sorted((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))[0]
@@ -108,6 +110,27 @@ def test_a_relative_path_and_another_part(
     assert {row["obj_id"] for row in table(target)} <= {"1"}  # not that of the motor, which is 2
 
 
+def test_units_are_those_of_the_user_s_numbers(
+    card: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given: list[Part] = []
+
+    def export(estimator: object, part: Part, path: Path, points: int) -> int:
+        given.append(part)
+        return 1
+
+    monkeypatch.setattr("kmn_jax.detection.export_estimator", export)
+    for flags in ([], ["--units", "m"]):
+        assert main(["export", "--object", str(card), "-o", str(tmp_path / "a.jaxexport"), *flags]) == 0
+    assert [part.unit for part in given] == ["mm", "m"]
+    assert given[1].diameter == pytest.approx(given[0].diameter / 1000)
+    assert "in m\n" in capsys.readouterr().out
+    (tmp_path / "small.stl").write_bytes(trimesh.creation.box((0.05, 0.02, 0.02)).export(file_type="stl"))
+    assert main(["prepare", str(tmp_path / "small.stl")]) == 0
+    said = capsys.readouterr().out
+    assert "note: is the object really 0.0574 mm large? If its numbers are metres, say --units m\n" in said
+
+
 def test_it_is_no_failure_if_nobody_reads_what_is_printed(tmp_path: Path) -> None:
     target = tmp_path / "motor.kmn"
     read, write = os.pipe()
@@ -160,6 +183,7 @@ def test_bad_input_is_one_sentence_and_exit_2(
         ({"--json": str(cloud)}, "it is read, too"),
         ({"--weights": "large"}, "no released model"),
         ({"--base-camera": str(tmp_path / "none.json")}, "none.json"),
+        ({"--grasps": str(tmp_path / "base.json")}, "cannot be used as grasps"),
         ({"--base-camera": str(tmp_path / "camera.json")}, "cannot be used as a pose"),
         ({"--base-camera": str(tmp_path / "base.json"), "--sensor": "0,0,0"}, "leave --sensor out"),
     ]

@@ -21,7 +21,7 @@ from kmn_jax.detection._grasps import with_grasps
 from kmn_jax.detection._result import Detections
 from kmn_jax.detection._scan_frame import base_from_scene, in_base, scan_frame
 from kmn_jax.detection._scene import Scene, make_scene, nearest_row
-from kmn_jax.detection._sources import GraspSource, PartSource, ScanSource, arranged, grasps_of
+from kmn_jax.detection._sources import GraspSource, PartSource, ScanSource, arranged, grasps_of, object_of
 from kmn_jax.detection._timing import Clock
 from kmn_jax.errors import InputError, float_array
 from kmn_jax.io import (
@@ -32,24 +32,21 @@ from kmn_jax.io import (
     read_scan,
     resolve_unit,
     scene_size,
+    size_question,
 )
 from kmn_jax.models import Model, load_model, released_file
 from kmn_jax.objects import (
     ObjectConfig,
-    ObjectModel,
     Part,
-    load_object,
     load_part,
     make_part,
     model_digest,
-    object_from_cloud,
-    object_from_mesh,
 )
 from kmn_jax.typing import ArrayInput
-from kmn_jax.units import Unit, check_unit
+from kmn_jax.units import Unit
 
 _UNFITTED = "the probabilities were fitted for other weights: fit them with experiments.calibrate"
-_NUM_POINTS = 4096  # on a part's surface
+_OBJECT = ObjectConfig(num_points=4096)
 _CARD = ".kmn"
 _MOST_SEED = 2**32 - 1
 _SAME_SIZE = 0.03  # between the lengths of a part and of the same one in a dataset
@@ -88,18 +85,13 @@ class PoseEstimator:
 
         `source` is a path (STL, OBJ, PLY, GLB, STEP, PCD, XYZ, or .kmn, a card), an array (n, 3) or (n, 6) of points
         and normals, a pair of vertices (v, 3) and triangles (t, 3), or anything with `vertices` and `faces`. `unit`
-        is that of its lengths: by default the file's own, else millimetres. Raises InputError if there is no surface
-        in it.
+        is that of its numbers, by default millimetres. Cards, STEP and GLB files state theirs: they are converted to
+        `unit`, if it is given. Raises InputError if there is no surface in it.
         """
         if isinstance(source, str | Path) and Path(source).suffix.lower() == _CARD:
             part = load_part(source, self.digest)
-            if unit is not None and check_unit(unit) != part.unit:
-                raise InputError(
-                    f"{source} says that its lengths are {part.unit}, not {unit}: make the card again with kmn prepare"
-                    " --units"
-                )
-            return part
-        return make_part(_object(source, unit, name), self.model, self.digest)
+            return part if unit is None else part.in_unit(unit)
+        return make_part(object_of(source, unit, name, _OBJECT), self.model, self.digest)
 
     def scene(
         self,
@@ -129,6 +121,7 @@ class PoseEstimator:
         problem = length_problem(smallest.diameter, smallest.unit, size)
         if problem is not None:
             raise InputError(problem)
+        question = size_question(smallest.diameter, smallest.unit, "--object-units")
         options = background or ForegroundOptions()
         # Margins are those of the smallest part, but a plane is background only if it is no part's.
         options = replace(options, least_extent=options.least_extent * ratio)
@@ -136,7 +129,7 @@ class PoseEstimator:
         scene = make_scene(read, diameter, sensor=frame.sensor, background=options, keep=_places(at))
         return replace(
             scene,
-            warnings=(*self.warnings, *frame.warnings, *scene.warnings),
+            warnings=(*self.warnings, *filter(None, (question,)), *frame.warnings, *scene.warnings),
             doubt=length_doubt(smallest.diameter, smallest.unit, size),
             truth=truth,
             bop_ids=bop_ids,
@@ -344,22 +337,3 @@ def _read(
     if not real.any():
         raise InputError(f"none of the scan's {len(array)} points was measured: all are NaN, infinite or zero")
     return Scan(array[real], None, None, None, resolve_unit(asked, part.unit)), None, nothing
-
-
-def _object(source: PartSource, unit: str | None, name: str | None) -> ObjectModel:
-    config = ObjectConfig(num_points=_NUM_POINTS)
-    if isinstance(source, str | Path):
-        return load_object(source, unit, config)
-    unit, name = check_unit(unit or "mm"), name or "part"
-    if not isinstance(source, np.ndarray):
-        if not isinstance(source, tuple) and hasattr(source, "vertices") and hasattr(source, "faces"):
-            source = (source.vertices, source.faces)
-        if not isinstance(source, tuple) or len(source) != 2:
-            raise InputError(f"an object cannot be made of a {type(source).__name__}: give a file, a cloud or a mesh")
-        vertices, triangles = (np.asarray(array) for array in source)
-        return object_from_mesh(name, vertices.astype(np.float64), triangles.astype(np.int64), unit, config)
-    cloud = np.asarray(source)
-    if cloud.ndim != 2 or cloud.shape[1] not in (3, 6):
-        raise InputError(f"the object's cloud has shape {cloud.shape}, but must be (n, 3), or (n, 6) with normals")
-    normals = cloud[:, 3:].astype(np.float64) if cloud.shape[1] == 6 else None
-    return object_from_cloud(name, cloud[:, :3].astype(np.float64), normals, unit, config)

@@ -150,10 +150,15 @@ def _surroundings(
 
     T_camera_object = np.linalg.inv(scene.T_scene_camera) @ copy.T_scene_object
     surface = placed(T_camera_object, part.points.astype(np.float64))
-    measured = scene.points if scene.empty is None else np.concatenate([scene.points, scene.empty])
-    near = measured[np.linalg.norm(measured - T_camera_object[:3, 3], axis=1) <= reach]
-    away = cKDTree(surface).query(near)[0] if len(near) else np.zeros(0)
-    return near[away > _margin(part, len(surface))].astype(np.float32), surface[:_OWN_POINTS].astype(np.float32)
+
+    def near(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
+        return points[np.linalg.norm(points - T_camera_object[:3, 3], axis=1) <= reach]
+
+    seen = near(scene.points)
+    others = seen[cKDTree(surface).query(seen)[0] > _margin(part, len(surface))] if len(seen) else seen
+    if scene.empty is not None:  # none of its points is the copy's
+        others = np.concatenate([others, near(scene.empty)])
+    return others.astype(np.float32), surface[:_OWN_POINTS].astype(np.float32)
 
 
 @jax.jit

@@ -9,9 +9,18 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 import numpy as np
 
 from kmn_jax.errors import InputError
-from kmn_jax.io import CameraMatrix, Scan, depth_array_scan
-from kmn_jax.objects import Grasps, load_grasps
+from kmn_jax.io import CameraMatrix, Scan, depth_array_scan, stated_unit
+from kmn_jax.objects import (
+    Grasps,
+    ObjectConfig,
+    ObjectModel,
+    load_grasps,
+    load_object,
+    object_from_cloud,
+    object_from_mesh,
+)
 from kmn_jax.typing import ArrayInput
+from kmn_jax.units import check_unit
 
 
 class MeshLike(Protocol):
@@ -66,3 +75,25 @@ def grasps_of(given: GraspSource | Sequence[GraspSource | None] | None, count: i
             f"grasps are given for {len(each)} parts, but there are {count}: give a file, or none, for each"
         )
     return [load_grasps(one) if isinstance(one, str | Path) else one for one in each]
+
+
+def object_of(source: PartSource, unit: str | None, name: str | None, config: ObjectConfig) -> ObjectModel:
+    """Make an object model of what a part can be given as, see `PoseEstimator.prepare`."""
+    if isinstance(source, str | Path):
+        stated = stated_unit(source)
+        if stated is None:
+            return load_object(source, unit, config)
+        return load_object(source, None, config).in_unit(unit or stated)
+    unit, name = check_unit(unit or "mm"), name or "part"
+    if not isinstance(source, np.ndarray):
+        if not isinstance(source, tuple) and hasattr(source, "vertices") and hasattr(source, "faces"):
+            source = (source.vertices, source.faces)
+        if not isinstance(source, tuple) or len(source) != 2:
+            raise InputError(f"an object cannot be made of a {type(source).__name__}: give a file, a cloud or a mesh")
+        vertices, triangles = (np.asarray(array) for array in source)
+        return object_from_mesh(name, vertices.astype(np.float64), triangles.astype(np.int64), unit, config)
+    cloud = np.asarray(source)
+    if cloud.ndim != 2 or cloud.shape[1] not in (3, 6):
+        raise InputError(f"the object's cloud has shape {cloud.shape}, but must be (n, 3), or (n, 6) with normals")
+    normals = cloud[:, 3:].astype(np.float64) if cloud.shape[1] == 6 else None
+    return object_from_cloud(name, cloud[:, :3].astype(np.float64), normals, unit, config)

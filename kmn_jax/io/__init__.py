@@ -3,8 +3,9 @@
 from kmn_jax.io._depth_arrays import CameraMatrix, depth_array_scan
 from kmn_jax.io._meshes import MESH_SUFFIXES, check_triangles, read_file, read_mesh
 from kmn_jax.io._poses import in_other_unit, pose_matrix, pose_of, read_pose
-from kmn_jax.io._scale import length_doubt, length_problem, resolve_unit, scene_size
+from kmn_jax.io._scale import length_doubt, length_problem, resolve_unit, scene_size, size_question
 from kmn_jax.io._scans import DepthCamera, Scan, depth_scan, read_scan
+from kmn_jax.io._stated import stated_unit
 
 __all__ = [
     "MESH_SUFFIXES",
@@ -25,4 +26,6 @@ __all__ = [
     "read_scan",
     "resolve_unit",
     "scene_size",
+    "size_question",
+    "stated_unit",
 ]

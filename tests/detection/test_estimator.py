@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import trimesh
 
 from kmn_jax.bop import bop_scan
 from kmn_jax.detection import (
@@ -24,9 +25,10 @@ from kmn_jax.detection import (
     symmetry_transforms,
     table,
 )
+from kmn_jax.detection._sources import object_of
 from kmn_jax.errors import InputError
 from kmn_jax.io import Scan
-from kmn_jax.objects import Part, save_part
+from kmn_jax.objects import ObjectConfig, Part, save_part
 from kmn_jax.pose import adi, mssd
 from tests.reference.meshes import Mesh, box, random_rotations
 from tests.reference.meshes import pose as placed
@@ -34,6 +36,7 @@ from tests.reference.solids import revolution
 
 ASSETS = Path(__file__).parent.parent.parent / "experiments" / "assets"
 IMAGES = sorted((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))
+STEP = Path(__file__).parent.parent / "io" / "files" / "box.step"
 MOTOR = ASSETS / "industrial" / "gear_motor.stl"
 
 
@@ -223,10 +226,25 @@ def test_what_cannot_be_is_one_sentence(estimator: PoseEstimator, motor: Part, t
         estimator.scene(scan, [])
     save_part(motor, tmp_path / "motor.kmn")
     assert estimator.prepare(tmp_path / "motor.kmn", "mm").unit == "mm"
-    with pytest.raises(InputError, match="says that its lengths are mm, not m: make the card again"):
-        estimator.prepare(tmp_path / "motor.kmn", "m")
+    in_metres = estimator.prepare(tmp_path / "motor.kmn", "m")  # a card states its unit: it is converted
+    assert in_metres.unit == "m"
+    assert in_metres.diameter == pytest.approx(motor.diameter / 1000)
     with pytest.raises(InputError, match="there is no released model"):
         PoseEstimator.from_pretrained("none")
+
+
+def test_cad_files_that_state_their_unit_keep_it_and_are_converted(tmp_path: Path) -> None:
+    config = ObjectConfig(num_points=256)
+    (tmp_path / "box.glb").write_bytes(trimesh.creation.box((0.04, 0.02, 0.01)).export(file_type="glb"))
+    for source, unit, found in (
+        (STEP, None, "mm"),
+        (tmp_path / "box.glb", None, "m"),
+        (tmp_path / "box.glb", "mm", "mm"),
+    ):
+        model = object_of(source, unit, None, config)
+        assert model.unit == found
+        size = 40.0 if source is not STEP else 20.0
+        assert model.extents.max() == pytest.approx(size / (1000 if found == "m" else 1), rel=1e-5)
 
 
 def test_a_scan_without_the_part_is_an_empty_or_doubtful_result(estimator: PoseEstimator, motor: Part) -> None:
