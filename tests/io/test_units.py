@@ -82,8 +82,8 @@ def test_the_sentence_as_a_whole() -> None:
     )
     assert length_problem(60 / 25.4, "mm", scene(MOTOR, "mm")) == (
         "the object of 2.36 mm is far too small for the scene of 500 mm: the object would fit 25.4 times larger, so its"
-        " lengths are probably inches (centimetres for the object would fit, too): say --object-units in (a card is made again"
-        " by kmn prepare --units in, a GLB or STEP file is to be exported again)"
+        " lengths are probably inches (centimetres for the object would fit, too): say --object-units in (a card is"
+        " made again by kmn prepare --units in, a GLB or STEP file is to be exported again)"
     )
 
 
