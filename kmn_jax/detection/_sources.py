@@ -48,6 +48,8 @@ def arranged(
     scan: ScanSource, K: CameraMatrix | None, depth_unit: str | float | None, camera: object, unit: str | None
 ) -> ScanSource:
     """Return arrays as scans or points (n, 3). Raises InputError for arguments that contradict each other."""
+    if hasattr(scan, "__array__"):
+        scan = np.asarray(scan)  # of JAX, perhaps
     if K is None and depth_unit is None:
         if isinstance(scan, np.ndarray) and scan.ndim == 3 and scan.shape[2] == 3:
             return scan.reshape(-1, 3)

@@ -24,7 +24,7 @@ from tests.reference.meshes import pose, random_rotations
 
 NO_AXES = np.zeros((0, 3), np.float32)
 CENTER = np.float32([0.1, -0.2, 0.3])
-QUARTERS = Rotation.from_euler("z", [0, 90, 180, 270], degrees=True).as_matrix()
+QUARTERS = Rotation.from_euler("z", [[0], [90], [180], [270]], degrees=True).as_matrix()
 TRUE, OTHER = (pose(place, turn) for place, turn in zip(((1, 2, 3), (1.1, 2, 3)), random_rotations(2, 9), strict=True))
 
 
@@ -95,7 +95,7 @@ def plain_precision(scores: np.ndarray, right: np.ndarray, num_true: int) -> flo
     return total / 101
 
 
-@pytest.mark.parametrize(("seed", "count"), product(range(4), (1, 7, 40)))
+@pytest.mark.parametrize(("seed", "count"), list(product(range(4), (1, 7, 40))))
 def test_average_precision_against_its_definition(seed: int, count: int) -> None:
     generator = np.random.default_rng(seed)
     scores, right = generator.permutation(count) / count, generator.random(count) < 0.6
