@@ -46,7 +46,10 @@ def test_a_bin_in_all_forms_of_output(card: Path, tmp_path: Path, capsys: pytest
     arguments = [str(part) for pair in outputs.items() for part in pair]
     base = tmp_path / "base.json"
     base.write_text(json.dumps({"xyz": [0.5, 0, 1], "xyzw": [1, 0, 0, 0], "unit": "m"}))
-    arguments += ["--base-camera", str(base)]
+    gripper = {"boxes": [{"center": [0, 0, -25], "size": [10, 10, 50]}]}
+    ways = [{"name": "cup", "xyz": [18, 0, -10], "xyzw": [0, -(0.5**0.5), 0, 0.5**0.5]}]  # onto the side of the body
+    (tmp_path / "grasps.json").write_text(json.dumps({"unit": "mm", "gripper": gripper, "grasps": ways}))
+    arguments += ["--base-camera", str(base), "--grasps", str(tmp_path / "grasps.json")]
     code = main(
         [
             "detect",
@@ -76,7 +79,11 @@ def test_a_bin_in_all_forms_of_output(card: Path, tmp_path: Path, capsys: pytest
         T_base_camera = np.diag([1.0, -1, -1, 1])
         T_base_camera[:3, 3] = 500, 0, 1000
         np.testing.assert_allclose(pose["T_base_object"], T_base_camera @ pose["T_scene_object"], atol=1e-9)
+        for pick in pose["grasps"]:
+            assert pick["name"] == "cup"
+            np.testing.assert_allclose(pick["T_base_grasp"], T_base_camera @ pick["T_scene_grasp"], atol=1e-9)
     assert "in the robot's frame" in said.out
+    assert any(line.split()[:1] == ["rank"] and line.endswith("grasps") for line in said.out.splitlines())
     rows = table(outputs["--bop-csv"])
     assert [float(row["score"]) for row in rows] == [pose["probability"] for pose in found["poses"]]
     assert (rows[0]["scene_id"], rows[0]["im_id"], rows[0]["obj_id"]) == ("2", str(int(IMAGE.stem)), "2")
