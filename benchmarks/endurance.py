@@ -29,6 +29,7 @@ from kmn_jax.detection import Detections, PoseEstimator
 from kmn_jax.errors import InputError
 from kmn_jax.objects import Part
 from kmn_jax.report import environment, print_table, write_json
+from kmn_jax.units import check_unit
 
 WARM = 200  # detections before the level of memory is taken
 _LEVEL = 100  # detections that the level is the median of
@@ -163,7 +164,7 @@ def _step(
 def _detected(estimator: PoseEstimator, parts: dict[str, Part], frame: Frame) -> bytes | str:
     """Return the bits of what was accepted, or in words why nothing was."""
     try:
-        found = estimator.detect(parts[frame.part], frame.scan, frame.camera, frame.unit, frame.at)
+        found = estimator.detect(parts[frame.part], frame.scan, frame.camera, check_unit(frame.unit), frame.at)
     except InputError as error:
         return str(error)
     if any(pose.probability >= estimator.config.accepted for pose in found.poses):

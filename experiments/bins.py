@@ -10,19 +10,19 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 
 from experiments.test_sets import SPLIT
 from experiments.worlds import NAMES, TARGETS, kind_of
 from kmn_jax.bop import BopDataset, BopFrame, BopInstance, FrameKey
 from kmn_jax.data import load_models
-from kmn_jax.detection import Scene, bin_content, make_scene
+from kmn_jax.detection import Scene, bin_content, make_scene, symmetry_transforms
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import measured_points
 from kmn_jax.io import Scan
 from kmn_jax.models import Model
 from kmn_jax.objects import ObjectConfig, Part, make_part
-from kmn_jax.pose import adi
+from kmn_jax.pose import adi, mssd, symmetric_pose_error
 from kmn_jax.simulate import Bin
 
 _UNIT = "mm"
@@ -44,11 +44,27 @@ class TrueImage:
     def errors(self, poses: Float[np.ndarray, "s 4 4"]) -> Float[np.ndarray, "s i"]:
         """Return the ADI of poses against each true one, in diameters."""
         points = jnp.asarray(self.part.points[:_POINTS])
+        found = np.asarray(adi_of_pairs(self._pairs(poses), points))
+        return found[: len(poses) * len(self.truth)].reshape(len(poses), len(self.truth)) / self.part.diameter
+
+    def largest_errors(self, poses: Float[np.ndarray, "s 4 4"]) -> Float[np.ndarray, "s i"]:
+        """Return the MSSD of poses against each true one, in diameters."""
+        points, turns = jnp.asarray(self.part.points[:_POINTS]), symmetry_transforms(self.part.symmetries)
+        found = np.asarray(mssd_of_pairs(self._pairs(poses), points, jnp.asarray(turns)))
+        return found[: len(poses) * len(self.truth)].reshape(len(poses), len(self.truth)) / self.part.diameter
+
+    def offset(self, pose: Float[np.ndarray, "4 4"], copy: int) -> tuple[float, float]:
+        """Return by how many degrees, symmetries taken out, and millimetres a pose is off a true one."""
+        own = self.part.symmetries
+        given = (pose, self.truth[copy], own.rotations, own.axes, own.center)
+        turn, shift = symmetric_pose_error(*(np.asarray(value, dtype=np.float32) for value in given))
+        return float(np.degrees(turn)), float(shift)
+
+    def _pairs(self, poses: Float[np.ndarray, "s 4 4"]) -> Float32[np.ndarray, "p 2 4 4"]:
+        """Return each pose with each true one, padded to a power of two."""
         capacity = 1 << max(len(poses) * len(self.truth) - 1, 0).bit_length()
         pairs = np.stack(np.broadcast_arrays(poses[:, None], self.truth[None]), axis=2).reshape(-1, 2, 4, 4)
-        padded = np.concatenate([pairs, np.tile(np.eye(4), (capacity - len(pairs), 2, 1, 1))]).astype(np.float32)
-        found = np.asarray(adi_of_pairs(padded, points))[: len(pairs)]
-        return found.reshape(len(poses), len(self.truth)) / self.part.diameter
+        return np.concatenate([pairs, np.tile(np.eye(4), (capacity - len(pairs), 2, 1, 1))]).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -72,6 +88,12 @@ class WorldImage(TrueImage):
 def adi_of_pairs(pairs: jax.Array, points: jax.Array) -> jax.Array:
     """Return the ADI of pairs of poses (p, 2, 4, 4), the second one the true one, of an object's points (m, 3)."""
     return jax.lax.map(lambda pair: adi(pair[0], pair[1], points), pairs)
+
+
+@jax.jit
+def mssd_of_pairs(pairs: jax.Array, points: jax.Array, symmetries: jax.Array) -> jax.Array:
+    """Return the MSSD of pairs of poses (p, 2, 4, 4), the second one the true one, of an object's points (m, 3)."""
+    return jax.lax.map(lambda pair: mssd(pair[0], pair[1], points, symmetries), pairs)
 
 
 def bin_images(folder: Path, split: str, model: Model, every: int = 1) -> Iterator[BinImage]:

@@ -25,6 +25,7 @@ from kmn_jax.detection import PoseEstimator
 from kmn_jax.errors import InputError
 from kmn_jax.io import Scan, read_scan
 from kmn_jax.report import check_target, print_table, write_json
+from kmn_jax.units import check_unit
 
 _FORWARDS = np.diag([1.0, -1.0, -1.0, 1.0])  # from a frame whose z points backwards
 
@@ -81,7 +82,7 @@ def _truth(
 
 def detect_in(estimator: PoseEstimator, real: RealScan) -> dict[str, Any]:
     """Return what is found of a scan's copies."""
-    part = estimator.prepare(real.cad, real.cad_unit)
+    part = estimator.prepare(real.cad, check_unit(real.cad_unit))
     result = estimator.detect(part, real.scan)
     inside = part.in_unit(real.scan.unit)
     image = TrueImage(FrameKey(0, 0), inside, None, real.poses, np.ones(len(real.poses)))

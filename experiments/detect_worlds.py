@@ -72,8 +72,7 @@ class WorldTally:
 
     def add_stranger(self, found: Detections) -> None:
         """Count the poses of a part that is not there."""
-        wrong = [pose.probability for pose in found.poses]
-        counted = Tally(wrong, [False] * len(wrong), [False] * len(wrong))
+        counted = Tally.of_absent([pose.probability for pose in found.poses])
         self.found.extend(counted)
         self._add_absent(counted)
 

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import os
-import re
+import shlex
 import sys
 import traceback
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
 
+from kmn_jax import __version__
+from kmn_jax.arguments import joined, parsed
 from kmn_jax.errors import InputError, number_list
+from kmn_jax.extras import missing_packages
 from kmn_jax.files import check_output, write_whole
 
 if TYPE_CHECKING:
@@ -26,10 +26,9 @@ if TYPE_CHECKING:
     from kmn_jax.detection import Detections
     from kmn_jax.objects import Part
     from kmn_jax.serve import ServerAnswer
+    from kmn_jax.units import Unit
 
 Units = Literal["auto", "mm", "cm", "m", "in"]
-
-_VECTORS = ("--at", "--sensor", "--roi")  # flags whose values may begin with a minus sign
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,8 @@ class Request:
     units: Units = "auto"
     """Unit of the scene's lengths; auto: that of the object, or what the format says."""
     object_units: Units = "auto"
-    """Unit of the object's lengths; auto: what the format says, else millimetres."""
+    """Unit of the object's numbers; auto: what the format says, else millimetres. Cards, STEP and GLB files state
+    theirs, and are converted."""
     random_seed: int = 0
     """Number that all randomness starts from: the same inputs and number give the same poses."""
     background: Path | None = None
@@ -61,6 +61,11 @@ class Request:
     """Search on where nothing was found: takes longer in full bins, and finds a few copies more."""
     sensor: str | None = None
     """X,Y,Z of the sensor in the scene's frame; the origin unless given."""
+    base_camera: Path | None = None
+    """JSON with T_base_camera (4 x 4), or xyz and the quaternion xyzw, and perhaps unit, else the scene's: the camera's
+    pose in the robot's frame, in which poses are then told, too."""
+    grasps: Path | None = None
+    """File of the object's grasps, see docs/grasps.md: poses then carry those that are free."""
     weights: str = "small"
     """Released network, or a .safetensors file."""
 
@@ -76,10 +81,12 @@ def prepare(
     Args:
         source: CAD file (STL, OBJ, PLY, GLB, STEP) or cloud of the whole surface (PLY, PCD, XYZ).
         output: the card; by default beside the source, ending in .kmn.
-        units: unit of the source's lengths; auto: what the format says, else millimetres.
+        units: unit of the source's numbers; auto: what the format says, else millimetres. STEP and GLB files state
+            theirs: of them it is the unit that the card will be in.
         weights: released network, or a .safetensors file.
     """
     from kmn_jax.detection import PoseEstimator
+    from kmn_jax.io import size_question
     from kmn_jax.objects import save_part
 
     target = output or source.parent / f"{source.stem}.kmn"
@@ -87,6 +94,9 @@ def prepare(
     part = PoseEstimator.from_pretrained(weights).prepare(source, _unit(units))
     save_part(part, target)
     print(f"{part.name}: {_size(part)}, {_symmetry(part)}; wrote {target}")
+    question = size_question(part.diameter, part.unit, "--units")
+    if question is not None:
+        print(f"note: {question}")
 
 
 def detect(
@@ -113,7 +123,8 @@ def detect(
         raise InputError(f"top is {top}, but must be at least 1")
     for target in (json, bop_csv, save_picture):
         if target is not None:
-            check_output(target, request.object, request.scene, request.camera, request.background)
+            read = (request.camera, request.background, request.base_camera, request.grasps)
+            check_output(target, request.object, request.scene, *read)
     if save_picture is not None:
         from kmn_jax.viz import check_picture
 
@@ -206,6 +217,7 @@ def export(
     object: Path,
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     units: Units = "auto",
+    object_units: Units = "auto",
     points: int = 65_536,
     weights: str = "small",
 ) -> None:
@@ -214,7 +226,8 @@ def export(
     Args:
         object: CAD file, cloud of the whole surface, or object card (.kmn).
         output: the artefact; docs/detect.md tells how to call it.
-        units: unit of the object's lengths and of the scans that the artefact will be given; auto: the object's own.
+        units: unit of the scans that the artefact will be given, and of its poses; auto: that of the object.
+        object_units: unit of the object's numbers, as in kmn detect.
         points: how many points its scans hold at most.
         weights: released network, or a .safetensors file.
     """
@@ -222,7 +235,8 @@ def export(
 
     check_output(output, object)
     estimator = PoseEstimator.from_pretrained(weights)
-    part = estimator.prepare(object, _unit(units))
+    part = estimator.prepare(object, _unit(object_units))
+    part = part.in_unit(_unit(units) or part.unit)
     size = export_estimator(estimator, part, output, points)
     print(f"wrote {output}: {size / 1e6:.1f} MB, scans of up to {points} points in {part.unit}")
 
@@ -256,6 +270,8 @@ def _ask(request: Request, server: str, top: int | None, picture: bool) -> Serve
 
     if request.weights != "small":
         raise InputError("the server has weights of its own: leave out --weights, or start it with them")
+    if request.base_camera is not None or request.grasps is not None:
+        raise InputError("a server knows no robot: leave out --base-camera and --grasps, or search here")
     files = (request.object, request.scene, request.camera, request.background)
     names = ("at", "object_units", "random_seed", "roi", "plane", "thorough", "sensor")
     fields = {name: getattr(request, name) for name in names}
@@ -267,6 +283,8 @@ class _Session:
 
     def __init__(self, request: Request) -> None:
         from kmn_jax.detection import THOROUGH, Clock, ForegroundOptions, OrientedBox, PoseEstimator
+        from kmn_jax.io import read_pose
+        from kmn_jax.objects import load_grasps
 
         places = [number_list(text, "--at", 3) for text in request.at]
         region: Any = None if request.roi is None else tuple(number_list(request.roi, "--roi", 6, 9))
@@ -274,6 +292,10 @@ class _Session:
             region = OrientedBox.of_numbers(region)
         sensor = None if request.sensor is None else np.array(number_list(request.sensor, "--sensor", 3))
         self.places = np.array(places) if places else None
+        self._base = None if request.base_camera is None else read_pose(request.base_camera, "T_base_camera")
+        if self._base is not None and sensor is not None:
+            raise InputError("--base-camera is for scans in the camera's frame: leave --sensor out")
+        self._grasps = None if request.grasps is None else load_grasps(request.grasps)
         self._request, self._clock = request, Clock()
         with self._clock("part"):
             self.estimator = PoseEstimator.from_pretrained(request.weights, THOROUGH if request.thorough else None)
@@ -295,14 +317,25 @@ class _Session:
     def detect(self, places: Float[np.ndarray, "k 3"] | None) -> Detections:
         """Search the scan, or places of it only."""
         from kmn_jax.detection import Clock
+        from kmn_jax.io import in_other_unit
 
         clock, self._clock = self._clock, Clock()
+        base = None
+        if self._base is not None:
+            pose, unit = self._base
+            base = in_other_unit(pose, unit or self.scene.unit, self.scene.unit)
         return self.estimator.detect(
-            self.part, self.scene, at=places, random_seed=self._request.random_seed, clock=clock
+            self.part,
+            self.scene,
+            at=places,
+            T_base_camera=base,
+            grasps=self._grasps,
+            random_seed=self._request.random_seed,
+            clock=clock,
         )
 
 
-def _unit(units: Units) -> str | None:
+def _unit(units: Units) -> Unit | None:
     return None if units == "auto" else units
 
 
@@ -316,54 +349,6 @@ def _symmetry(part: Part) -> str:
     if len(found.axes):
         return "turns about an axis look the same" if len(found.axes) == 1 else "looks the same from all sides"
     return f"{len(found.rotations)} poses look the same" if part.is_symmetric else "no symmetry"
-
-
-def _joined(arguments: list[str]) -> list[str]:
-    """Return arguments in which a value that begins with a minus sign is joined to its flag."""
-    result: list[str] = []
-    for argument in arguments:
-        if result and result[-1] in _VECTORS and argument.startswith("-") and "," in argument:
-            result[-1] += f"={argument}"
-        else:
-            result.append(argument)
-    return result
-
-
-def _parsed(arguments: list[str]) -> Callable[[], None]:
-    """Return the command that the arguments ask for, to be run; raise InputError, in one sentence, for wrong ones."""
-
-    def later(call: Callable[..., None]) -> Callable[..., Callable[[], None]]:
-        return wraps(call)(lambda *values, **named: partial(call, *values, **named))
-
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(said):
-            commands: dict[str, Any] = {
-                call.__name__: later(call) for call in (prepare, detect, view, serve, export, convert)
-            }
-            chosen: Callable[[], None] = tyro.extras.subcommand_cli_from_dict(commands, prog="kmn", args=arguments)
-            return chosen
-    except SystemExit as error:
-        if not error.code:  # of --help
-            raise
-    raise InputError(_sentence(said.getvalue()))
-
-
-def _sentence(box: str) -> str:
-    """Return what a box of the parser says of wrong arguments in one sentence, without the help texts in it."""
-    box = re.sub(r"\x1b\[[\d;]*m", "", box)  # colours
-    lines = [line[2:-1].rstrip() for line in box.splitlines()[1:] if not line.startswith("╰")]  # below its title
-    parts: list[list[str]] = [[]]
-    for line in lines:
-        if re.fullmatch("[─-]{3,}", line):
-            parts.append([])
-        elif not line:  # what follows are details
-            break
-        elif not line.startswith(" " * 5):  # where help texts are
-            parts[-1].append(line.strip())
-    said = "; ".join(" ".join(part).rstrip(".") for part in parts if part and not part[0].startswith("For full help"))
-    helped = re.search(r"kmn(?: \w+)? --help", box)
-    return f"{said or box.strip()}: see {helped[0] if helped else 'kmn --help'}"
 
 
 def _keep_compiled() -> None:
@@ -384,9 +369,12 @@ def _keep_compiled() -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line: 0 is success, 2 bad input (one sentence on stderr), 1 our own failure."""
-    arguments = _joined(sys.argv[1:] if arguments is None else arguments)
+    arguments = joined(sys.argv[1:] if arguments is None else arguments)
+    if arguments == ["--version"]:
+        print(f"kmn {__version__}")
+        return 0
     try:
-        run = _parsed(arguments)
+        run = parsed(arguments, (prepare, detect, view, serve, export, convert))
         from kmn_jax.geometry import ask_for_fast_selection
 
         ask_for_fast_selection()
@@ -399,7 +387,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"kmn: {error}", file=sys.stderr)
         return 2
     except ModuleNotFoundError as error:
-        print(f"kmn: this needs the package {error.name}: pip install 'kmn_jax[all]'", file=sys.stderr)
+        wanted = " ".join(shlex.quote(package) for package in missing_packages(error.name or "kmn_jax"))
+        print(f"kmn: this needs packages that are not installed: pip install {wanted}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
 import numpy as np
 from jaxtyping import Float
 
@@ -11,12 +13,17 @@ METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}  # one of each unit, 
 _DECIMALS = {"m": 4, "cm": 2, "mm": 1, "in": 3}  # to a tenth of a millimetre
 _LONG = 1e4
 
+if TYPE_CHECKING:
+    Unit: TypeAlias = Literal["m", "cm", "mm", "in"]
+else:
+    Unit = str  # any text is taken, and judged by `check_unit`
 
-def check_unit(unit: str) -> str:
+
+def check_unit(unit: str) -> Unit:
     """Return a known unit of length, or raise InputError."""
     if unit not in METRES:
         raise InputError(f"unit {unit!r} is not known: use one of {', '.join(METRES)}")
-    return unit
+    return unit  # type: ignore[return-value]
 
 
 def place_text(place: Float[np.ndarray, "3"], unit: str) -> list[str]:

@@ -13,10 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from kmn_jax.bop import bop_scan
 from kmn_jax.cli import main
 from kmn_jax.detection import PoseEstimator
+from kmn_jax.objects import Part
 from kmn_jax.serve import ServeConfig
 from tests.serve.serve_sample import running
 
@@ -46,6 +48,12 @@ def test_a_bin_in_all_forms_of_output(card: Path, tmp_path: Path, capsys: pytest
     outputs = {flag: tmp_path / name for flag, name in (("--json", "a.json"), ("--bop-csv", "a.csv"))}
     picture = tmp_path / "a.png"
     arguments = [str(part) for pair in outputs.items() for part in pair]
+    base = tmp_path / "base.json"
+    base.write_text(json.dumps({"xyz": [0.5, 0, 1], "xyzw": [1, 0, 0, 0], "unit": "m"}))
+    gripper = {"boxes": [{"center": [0, 0, -25], "size": [10, 10, 50]}]}
+    ways = [{"name": "cup", "xyz": [18, 0, -10], "xyzw": [0, -(0.5**0.5), 0, 0.5**0.5]}]  # onto the side of the body
+    (tmp_path / "grasps.json").write_text(json.dumps({"unit": "mm", "gripper": gripper, "grasps": ways}))
+    arguments += ["--base-camera", str(base), "--grasps", str(tmp_path / "grasps.json")]
     code = main(
         [
             "detect",
@@ -70,6 +78,16 @@ def test_a_bin_in_all_forms_of_output(card: Path, tmp_path: Path, capsys: pytest
     assert {"T_scene_object", "probability", "inliers", "visible_fraction", "runner_up_gap", "warnings"} <= found[
         "poses"
     ][0].keys()
+    for pose in found["poses"]:
+        assert pose["num_inliers"] == pose["inliers"]
+        T_base_camera = np.diag([1.0, -1, -1, 1])
+        T_base_camera[:3, 3] = 500, 0, 1000
+        np.testing.assert_allclose(pose["T_base_object"], T_base_camera @ pose["T_scene_object"], atol=1e-9)
+        for pick in pose["grasps"]:
+            assert pick["name"] == "cup"
+            np.testing.assert_allclose(pick["T_base_grasp"], T_base_camera @ pick["T_scene_grasp"], atol=1e-9)
+    assert "in the robot's frame" in said.out
+    assert any(line.split()[:1] == ["rank"] and line.endswith("grasps") for line in said.out.splitlines())
     rows = table(outputs["--bop-csv"])
     assert [float(row["score"]) for row in rows] == [pose["probability"] for pose in found["poses"]]
     assert (rows[0]["scene_id"], rows[0]["im_id"], rows[0]["obj_id"]) == ("2", str(int(IMAGE.stem)), "2")
@@ -126,6 +144,27 @@ def test_a_relative_path_and_another_part(
     assert {row["obj_id"] for row in table(target)} <= {"1"}  # not that of the motor, which is 2
 
 
+def test_units_are_those_of_the_user_s_numbers(
+    card: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given: list[Part] = []
+
+    def export(estimator: object, part: Part, path: Path, points: int) -> int:
+        given.append(part)
+        return 1
+
+    monkeypatch.setattr("kmn_jax.detection.export_estimator", export)
+    for flags in ([], ["--units", "m"]):
+        assert main(["export", "--object", str(card), "-o", str(tmp_path / "a.jaxexport"), *flags]) == 0
+    assert [part.unit for part in given] == ["mm", "m"]
+    assert given[1].diameter == pytest.approx(given[0].diameter / 1000)
+    assert "in m\n" in capsys.readouterr().out
+    (tmp_path / "small.stl").write_bytes(trimesh.creation.box((0.05, 0.02, 0.02)).export(file_type="stl"))
+    assert main(["prepare", str(tmp_path / "small.stl")]) == 0
+    said = capsys.readouterr().out
+    assert "note: is the object really 0.0574 mm large? If its numbers are metres, say --units m\n" in said
+
+
 def test_bad_input_is_one_sentence_and_exit_2(
     card: Path, cloud: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -134,6 +173,7 @@ def test_bad_input_is_one_sentence_and_exit_2(
     (tmp_path / "renamed.ply").write_bytes(MOTOR.read_bytes())
     (tmp_path / "nothing.stl").write_text("solid a\nendsolid a\n")
     (tmp_path / "camera.json").write_text("{")
+    (tmp_path / "base.json").write_text(json.dumps(np.eye(4).tolist()))
     np.save(tmp_path / "nan.npy", np.full((10, 3), np.nan, np.float32))
     np.save(tmp_path / "metres.npy", np.load(cloud) / 1000)
     np.save(tmp_path / "depth.npy", np.ones((40, 50), np.float32))
@@ -160,6 +200,10 @@ def test_bad_input_is_one_sentence_and_exit_2(
         ({"--json": str(tmp_path / "missing" / "a.json")}, "folder does not exist"),
         ({"--json": str(cloud)}, "it is read, too"),
         ({"--weights": "large"}, "no released model"),
+        ({"--base-camera": str(tmp_path / "none.json")}, "none.json"),
+        ({"--grasps": str(tmp_path / "base.json")}, "cannot be used as grasps"),
+        ({"--base-camera": str(tmp_path / "camera.json")}, "cannot be used as a pose"),
+        ({"--base-camera": str(tmp_path / "base.json"), "--sensor": "0,0,0"}, "leave --sensor out"),
     ]
     for changes, message in cases:
         arguments = [part for pair in (whole | changes).items() for part in pair]

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kmn_jax.bop import bop_scan
+from kmn_jax.io import Scan
 from kmn_jax.models._torch_file import state_dict_bytes
 from tests.golden.make_network import draw_state_dict
 from tests.reference.clouds import box_cloud, scene_crop
@@ -25,7 +27,19 @@ FILES = {
     "small_pack": ASSETS / "small_pack",
     "small_test_set": ASSETS / "small_test_set",
 }
+IMAGE = ASSETS / "small_test_set" / "test" / "000002" / "depth" / "000000.png"
+T_BASE_CAMERA = np.array([[0, -1, 0, 300.0], [-1, 0, 0, 50.0], [0, 0, -1, 900.0], [0, 0, 0, 1]])  # it looks down
+
+
+def image() -> Scan:
+    return bop_scan(IMAGE)[0]
+
+
 GIVEN = {
+    "depth": lambda: np.rint(image().depth).astype(np.uint16),
+    "K": lambda: image().camera.matrix,
+    "T_base_camera": lambda: T_BASE_CAMERA,
+    "cloud_in_robot_frame": lambda: (image().points @ T_BASE_CAMERA[:3, :3].T + T_BASE_CAMERA[:3, 3]).astype("f4"),
     "cloud": lambda: box_cloud(0, 2048),
     "keypoint_indices": lambda: np.arange(20) * 100,
     "crop": lambda: scene_crop(0, 2048),

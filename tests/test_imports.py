@@ -28,7 +28,7 @@ ROOMS = (
     "serve",
     "cli",
 )
-RANKS = dict.fromkeys(("typing", "errors", "units", "files", "limits", "report", "web"), 0) | {
+RANKS = dict.fromkeys(("typing", "errors", "units", "extras", "files", "limits", "report", "web", "arguments"), 0) | {
     name: rank for rank, name in enumerate(ROOMS, start=1)
 }
 # Pairs of neighbours that the ranks alone would allow: the pose solver takes arrays, not models.

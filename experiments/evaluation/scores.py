@@ -1,4 +1,4 @@
-"""From predictions to recall under both gates, its intervals, and times."""
+"""From predictions to recall under both gates, its intervals, how exact right poses are, and times."""
 
 from __future__ import annotations
 
@@ -6,19 +6,31 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 
-from experiments.bins import adi_of_pairs
+from experiments.bins import adi_of_pairs, mssd_of_pairs
 from experiments.evaluation.configs import noise_name
 from experiments.evaluation.predictions import Export, Predictions, Truth
+from kmn_jax.detection import symmetry_transforms
 from kmn_jax.objects import ObjectModel
+from kmn_jax.pose import average_recall, symmetric_pose_error
 
 THRESHOLD = 0.1  # of the object's size
 _POINTS = 1000  # of an object's surface, for errors
 _REACH = 0.8  # diameters: copies whose centres are farther from the pose's are not near enough to be right
 _Z = 1.959964  # of a normal distribution's middle 95%
+
+
+class Offsets(NamedTuple):
+    """By how much each pose is off the nearest copy, symmetries taken out; infinite where no pose was found."""
+
+    degrees: Float[np.ndarray, " c"]
+    millimetres: Float[np.ndarray, " c"]  # between the object's centres
+    shares: Float[np.ndarray, " c"]  # the same in diameters
+    mssd: Float[np.ndarray, " c"]  # in diameters
 
 
 @dataclass(frozen=True)
@@ -32,6 +44,7 @@ class Cell:
     on_seed: Bool[np.ndarray, " c"]  # whether that copy is the one that the crop is around
     diagonal: Float[np.ndarray, " c"]  # of the object's bounding box, in diameters
     seconds: Float[np.ndarray, " c"]
+    offsets: Offsets | None = None
 
     def recall(self, gate: str = "diameter") -> float:
         """Return the share of right poses: ADI below a tenth of the diameter, or of the diagonal."""
@@ -65,8 +78,10 @@ def pooled(cells: Sequence[Cell], name: str) -> Cell:
     """Return cells of one method and noise as one."""
     first = cells[0]
     fields = ("errors", "on_seed", "diagonal", "seconds")
-    columns = [np.concatenate([getattr(cell, field) for cell in cells]) for field in fields]
-    return Cell(first.method, name, first.noise, *columns)
+    columns = {field: np.concatenate([getattr(cell, field) for cell in cells]) for field in fields}
+    offsets = [cell.offsets for cell in cells if cell.offsets is not None]
+    together = Offsets(*map(np.concatenate, zip(*offsets, strict=True))) if len(offsets) == len(cells) else None
+    return Cell(first.method, name, first.noise, **columns, offsets=together)
 
 
 def cells_of(
@@ -83,15 +98,16 @@ def cells_of(
                     _errors(poses, found, truth, model) for poses in (found.T_camera_object, found.refined)
                 )
                 size = np.full(len(coarse.errors), model.diagonal / model.diameter)
-                cells.append(Cell(title, name, noise, *coarse, size, found.seconds))
                 total = found.seconds + found.refine_seconds
-                cells.append(Cell(f"{title} + ICP", name, noise, *refined, size, total))
+                for text, scored, seconds in ((title, coarse, found.seconds), (f"{title} + ICP", refined, total)):
+                    cells.append(Cell(text, name, noise, scored.errors, scored.on_seed, size, seconds, scored.offsets))
     return cells
 
 
 class _Errors(NamedTuple):
     errors: Float[np.ndarray, " c"]
     on_seed: Bool[np.ndarray, " c"]
+    offsets: Offsets
 
 
 def _errors(poses: Float[np.ndarray, "c 4 4"], found: Predictions, truth: Truth, model: ObjectModel) -> _Errors:
@@ -109,22 +125,48 @@ def _errors(poses: Float[np.ndarray, "c 4 4"], found: Predictions, truth: Truth,
         rows += [row] * len(near)
         of_seed += [copy == seed for copy in near]
     errors, own = np.full(len(poses), np.inf), np.full(len(poses), np.inf)
+    offsets = Offsets(*np.full((4, len(poses)), np.inf))
     if pairs:
         each, is_own = pair_errors(np.stack(pairs), model), np.array(of_seed)
         np.minimum.at(errors, rows, each)
         np.minimum.at(own, np.array(rows)[is_own], each[is_own])
-    return _Errors(errors, np.isfinite(own) & (own <= errors))
+        nearest = {row: number for number, row in enumerate(rows) if each[number] <= errors[row]}
+        found_rows = list(nearest)
+        for column, values in zip(
+            offsets, _offsets(np.stack([pairs[k] for k in nearest.values()]), model), strict=True
+        ):
+            column[found_rows] = values
+    return _Errors(errors, np.isfinite(own) & (own <= errors), offsets)
+
+
+def _offsets(pairs: Float[np.ndarray, "p 2 4 4"], model: ObjectModel) -> Offsets:
+    """Return by how much the first one of pairs of poses is off the second, true one."""
+    near, points = _padded(pairs), jnp.asarray(model.points[:_POINTS], dtype=jnp.float32)
+    own = model.symmetries
+    symmetries = [jnp.asarray(value, dtype=jnp.float32) for value in (own.rotations, own.axes, own.center)]
+    turned, shifted = (np.asarray(value)[: len(pairs)] for value in _turned_and_shifted(near, *symmetries))
+    largest = np.asarray(mssd_of_pairs(near, points, jnp.asarray(symmetry_transforms(own))))[: len(pairs)]
+    return Offsets(np.degrees(turned), shifted, shifted / model.diameter, largest / model.diameter)
+
+
+@jax.jit
+def _turned_and_shifted(pairs: jax.Array, *symmetries: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return jax.lax.map(lambda pair: symmetric_pose_error(pair[0], pair[1], *symmetries), pairs)
 
 
 def pair_errors(pairs: Float[np.ndarray, "p 2 4 4"], model: ObjectModel) -> Float[np.ndarray, " p"]:
     """Return the ADI of pairs of poses, the second one the true one, in diameters."""
+    points = jnp.asarray(model.points[:_POINTS], dtype=jnp.float32)
+    return np.asarray(adi_of_pairs(_padded(pairs), points))[: len(pairs)] / model.diameter
+
+
+def _padded(pairs: Float[np.ndarray, "p 2 4 4"]) -> Float32[np.ndarray, "q 2 4 4"]:
+    """Return pairs of poses as seen from near to them, padded to a power of two."""
     capacity = 1 << max(len(pairs) - 1, 0).bit_length()
     origin = pairs[:, :1, :3, 3].copy()  # float32 of millimetres far from the camera would lose digits
     near = pairs.copy()
     near[:, :, :3, 3] -= origin
-    padded = np.concatenate([near, np.tile(np.eye(4), (capacity - len(pairs), 2, 1, 1))]).astype(np.float32)
-    points = jnp.asarray(model.points[:_POINTS], dtype=jnp.float32)
-    return np.asarray(adi_of_pairs(padded, points))[: len(pairs)] / model.diameter
+    return np.concatenate([near, np.tile(np.eye(4), (capacity - len(pairs), 2, 1, 1))]).astype(np.float32)
 
 
 def recall_rows(cells: Sequence[Cell], objects: str) -> list[dict[str, Any]]:
@@ -141,6 +183,33 @@ def recall_rows(cells: Sequence[Cell], objects: str) -> list[dict[str, Any]]:
         row["crops"] = len(everything)
         rows.append(row)
     return rows
+
+
+def accuracy_rows(cells: Sequence[Cell], noise: float) -> list[dict[str, Any]]:
+    """Return a table's rows at one noise: for each method, how exact right poses are, and its recall by MSSD."""
+    rows = []
+    for method, own in _by_method(cells).items():
+        whole = _by_noise([cell for cell in own if cell.noise == noise], "").get(noise)
+        if whole is None or whole.offsets is None or not len(whole.errors):
+            continue
+        right = whole.errors < THRESHOLD
+        off = whole.offsets
+        rows.append(
+            {
+                "method": method,
+                "shifted, mm": _median_and_most(off.millimetres[right]),
+                "shifted, % of the diameter": _median_and_most(100 * off.shares[right]),
+                "turned, degrees": _median_and_most(off.degrees[right]),
+                "MSSD recall": f"{(off.mssd < THRESHOLD).mean():.2f}",
+                "MSSD recall, BOP": f"{average_recall(off.mssd.astype(np.float32)):.2f}",
+            }
+        )
+    return rows
+
+
+def _median_and_most(values: Float[np.ndarray, " n"]) -> str:
+    """Return the median and the 90th percentile as text."""
+    return " / ".join(f"{np.percentile(values, share):.3g}" for share in (50, 90)) if len(values) else "-"
 
 
 def seed_rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:

@@ -39,15 +39,16 @@ from kmn_jax.detection._depth_agreement import (
 )
 from kmn_jax.detection._detect import THOROUGH, DetectConfig, chosen, detect, detections, explore, refined_candidates
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place, symmetry_transforms
-from kmn_jax.detection._estimator import PartSource, PoseEstimator, ScanSource
+from kmn_jax.detection._estimator import PoseEstimator
 from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
 from kmn_jax.detection._export import export_estimator
 from kmn_jax.detection._foreground import ForegroundOptions, OrientedBox, foreground
 from kmn_jax.detection._frames import into, placed
+from kmn_jax.detection._grasps import Conflict, Copy, grasp_conflict, with_grasps
 from kmn_jax.detection._mapping import call_rows, map_real, map_rows
 from kmn_jax.detection._output import as_json, table, write_bop_csv, write_json
 from kmn_jax.detection._picture_agreement import PictureAgreement, picture_agreement
-from kmn_jax.detection._result import CropPrediction, Detection, Detections, Timing
+from kmn_jax.detection._result import CropPrediction, Detection, Detections, Pick, Timing
 from kmn_jax.detection._scene import MOST_POINTS, Scene, make_scene
 from kmn_jax.detection._search import (
     Candidates,
@@ -62,6 +63,7 @@ from kmn_jax.detection._search import (
 )
 from kmn_jax.detection._seeds import NUM_SEEDS, seeds_at, seeds_over, spread_seeds
 from kmn_jax.detection._selection import Selection, select, select_poses
+from kmn_jax.detection._sources import GraspSource, MeshLike, PartSource, ScanSource
 from kmn_jax.detection._timing import Clock
 
 __all__ = [
@@ -76,6 +78,8 @@ __all__ = [
     "CalibrationArrays",
     "Candidates",
     "Clock",
+    "Conflict",
+    "Copy",
     "CropPoses",
     "CropPrediction",
     "CropSearchConfig",
@@ -89,8 +93,11 @@ __all__ = [
     "Draw",
     "DrawsSearch",
     "ForegroundOptions",
+    "GraspSource",
+    "MeshLike",
     "OrientedBox",
     "PartSource",
+    "Pick",
     "PictureAgreement",
     "PoseEstimator",
     "Prediction",
@@ -122,6 +129,7 @@ __all__ = [
     "fit_calibration",
     "foreground",
     "gather_evidence",
+    "grasp_conflict",
     "in_front_of_empty",
     "inside_bin",
     "into",
@@ -156,6 +164,7 @@ __all__ = [
     "surface_scores",
     "symmetry_transforms",
     "table",
+    "with_grasps",
     "write_bop_csv",
     "write_json",
 ]

@@ -83,6 +83,17 @@ def depth_agreement(
     )
 
 
+def farthest_at(
+    depth: Float[Array, "h w"], camera: Intrinsics, x: Float[Array, " r"], y: Float[Array, " r"], reach: int
+) -> Float[Array, " r"]:
+    """Return the farthest of what was measured around directions (x, y, 1), up to `reach` pixels away; zero if nothing.
+
+    Images of clouds have holes where no point fell into a pixel.
+    """
+    row, column, _ = _pixels(jnp.stack([x, y, jnp.ones_like(x)], axis=1), jnp.ones(x.shape, dtype=bool), camera)
+    return _window(depth, row, column, reach).max(axis=1)
+
+
 def depth_at(image: DepthImage, x: Float[Array, "*s"], y: Float[Array, "*s"]) -> Float[Array, "*s"]:
     """Return what was measured in directions (x, y, 1); zero where nothing was, and outside of the image."""
     camera = image.camera

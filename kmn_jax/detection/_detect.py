@@ -232,7 +232,7 @@ def detections(
 
 def _detection(row: int, probability: float, gap: float, found: Candidates, part: Part, scene: Scene) -> Detection:
     pose = canonical_pose(scene.T_scene_camera @ found.T_camera_object[row].astype(np.float64), part.symmetries)
-    shares = {name: float(found.evidence[row, EVIDENCE.index(name)]) for name in _SHARES}
+    shares: dict[str, Any] = {name: float(found.evidence[row, EVIDENCE.index(name)]) for name in _SHARES}
     prediction = crop_prediction(found, row)
     notes = ((_SYMMETRIC, part.is_symmetric), (_RIVALLED, gap < _CLOSE_GAP))
     return Detection(

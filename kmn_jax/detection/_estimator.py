@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeAlias, overload
+from typing import Literal, overload
 
 import numpy as np
 from jaxtyping import Float
@@ -14,32 +14,40 @@ from kmn_jax.bop import bop_object, bop_scan, bop_scene_id, is_bop_image
 from kmn_jax.detection._calibration import Probabilities, load_probabilities
 from kmn_jax.detection._detect import DetectConfig, detect
 from kmn_jax.detection._evidence import EVIDENCE
+from kmn_jax.detection._exclusion import apart
 from kmn_jax.detection._foreground import ForegroundOptions
 from kmn_jax.detection._frames import into
+from kmn_jax.detection._grasps import with_grasps
 from kmn_jax.detection._result import Detection, Detections
+from kmn_jax.detection._scan_frame import base_from_scene, in_base, scan_frame
 from kmn_jax.detection._scene import Scene, make_scene, nearest_row
+from kmn_jax.detection._sources import GraspSource, PartSource, ScanSource, arranged, grasps_of, object_of
 from kmn_jax.detection._timing import Clock
 from kmn_jax.errors import InputError, float_array
-from kmn_jax.io import Scan, held, length_doubt, length_problem, read_scan, resolve_unit, scene_size
+from kmn_jax.io import (
+    CameraMatrix,
+    Scan,
+    held,
+    length_doubt,
+    length_problem,
+    read_scan,
+    resolve_unit,
+    scene_size,
+    size_question,
+)
 from kmn_jax.models import Model, load_model, released_file
 from kmn_jax.objects import (
     ObjectConfig,
-    ObjectModel,
     Part,
-    load_object,
     load_part,
     make_part,
     model_digest,
-    object_from_cloud,
-    object_from_mesh,
 )
-from kmn_jax.units import check_unit
-
-PartSource: TypeAlias = Any  # see PoseEstimator.prepare
-ScanSource: TypeAlias = str | Path | np.ndarray | Scan
+from kmn_jax.typing import ArrayInput
+from kmn_jax.units import Unit
 
 _UNFITTED = "the probabilities were fitted for other weights: fit them with experiments.calibrate"
-_NUM_POINTS = 4096  # on a part's surface
+_OBJECT = ObjectConfig(num_points=4096)
 _CARD = ".kmn"
 _MOST_SEED = 2**32 - 1
 
@@ -53,6 +61,7 @@ class PoseEstimator:
     probabilities: Probabilities
     config: DetectConfig = field(default_factory=DetectConfig)
     warnings: tuple[str, ...] = ()  # go with every result
+    weights: str | None = None  # the name or file that the model was loaded by
 
     @classmethod
     def from_pretrained(cls, weights: str | Path = "small", config: DetectConfig | None = None) -> PoseEstimator:
@@ -68,34 +77,33 @@ class PoseEstimator:
         probabilities = load_probabilities(
             fitted if own else released_file("small").with_suffix(".calibration.json"), EVIDENCE
         )
-        return cls(model, model_digest(model), probabilities, config or DetectConfig(), () if own else (_UNFITTED,))
+        warnings = () if own else (_UNFITTED,)
+        return cls(model, model_digest(model), probabilities, config or DetectConfig(), warnings, str(weights))
 
-    def prepare(self, source: PartSource, unit: str | None = None, name: str | None = None) -> Part:
+    def prepare(self, source: PartSource, unit: Unit | None = None, name: str | None = None) -> Part:
         """Make a part of a CAD file, a cloud that covers the whole surface, a mesh or an object card.
 
         `source` is a path (STL, OBJ, PLY, GLB, STEP, PCD, XYZ, or .kmn, a card), an array (n, 3) or (n, 6) of points
         and normals, a pair of vertices (v, 3) and triangles (t, 3), or anything with `vertices` and `faces`. `unit`
-        is that of its lengths: by default the file's own, else millimetres. Raises InputError if there is no surface
-        in it.
+        is that of its numbers, by default millimetres. Cards, STEP and GLB files state theirs: they are converted to
+        `unit`, if it is given. Raises InputError if there is no surface in it.
         """
         if isinstance(source, str | Path) and Path(source).suffix.lower() == _CARD:
             part = load_part(source, self.digest)
-            if unit is not None and check_unit(unit) != part.unit:
-                raise InputError(
-                    f"{source} says that its lengths are {part.unit}, not {unit}: make the card again with kmn prepare"
-                    " --units"
-                )
-            return part
-        return make_part(_object(source, unit, name), self.model, self.digest)
+            return part if unit is None else part.in_unit(unit)
+        return make_part(object_of(source, unit, name, _OBJECT), self.model, self.digest)
 
     def scene(
         self,
         scan: ScanSource,
         part: Part | Sequence[Part],
         *,
-        unit: str | None = None,
+        unit: Unit | Literal["auto"] | None = None,
         camera: str | Path | None = None,
+        K: CameraMatrix | None = None,
+        depth_unit: Unit | float | None = None,
         sensor: Float[np.ndarray, "3"] | None = None,
+        T_scene_camera: ArrayInput | None = None,
         at: Float[np.ndarray, "*k 3"] | None = None,
         background: ForegroundOptions | None = None,
     ) -> Scene:
@@ -107,30 +115,45 @@ class PoseEstimator:
         if not parts:
             raise InputError("no object is given to make the scene for")
         smallest, ratio = parts[0], parts[-1].in_unit("m").diameter / parts[0].in_unit("m").diameter
-        read, truth, bop_ids = _read(scan, unit, camera, smallest)
+        read, truth, bop_ids = _read(arranged(scan, K, depth_unit, camera, unit), unit, camera, smallest)
+        frame = scan_frame(read, sensor, T_scene_camera)
         size = scene_size(read)
         problem = length_problem(smallest.diameter, smallest.unit, size)
         if problem is not None:
             raise InputError(problem)
         is_stated = camera is None and isinstance(scan, str | Path) and is_bop_image(scan)
+        question = size_question(smallest.diameter, smallest.unit, "--object-units")
         options = background or ForegroundOptions()
         # Margins are those of the smallest part, but a plane is background only if it is no part's.
         options = replace(options, least_extent=options.least_extent * ratio)
         diameter = smallest.in_unit(read.unit).diameter
         if sensor is not None:
             float_array(np.asarray(sensor, dtype=np.float64), "sensor", (3,))
-        scene = make_scene(read, diameter, sensor=sensor, background=options, keep=_places(at))
+        scene = make_scene(read, diameter, sensor=frame.sensor, background=options, keep=_places(at))
         return replace(
             scene,
-            warnings=(*self.warnings, *scene.warnings),
+            warnings=(*self.warnings, *filter(None, (question,)), *frame.warnings, *scene.warnings),
             doubt=None if is_stated else length_doubt(smallest.diameter, smallest.unit, size),
             truth=truth,
             bop_ids=bop_ids,
+            T_scene_sensor=frame.T_scene_sensor,
+            is_opengl=frame.is_opengl,
+            source=str(scan) if isinstance(scan, str | Path) else None,
+            empty=None if options.background is None else _points_of(options.background, scene),
         )
 
-    def read(self, scan: ScanSource, part: Part, unit: str | None = None, camera: str | Path | None = None) -> Scan:
+    def read(
+        self,
+        scan: ScanSource,
+        part: Part,
+        unit: Unit | Literal["auto"] | None = None,
+        camera: str | Path | None = None,
+        *,
+        K: CameraMatrix | None = None,
+        depth_unit: Unit | float | None = None,
+    ) -> Scan:
         """Read a scan as `scene` does, such as that of an empty bin."""
-        return _read(scan, unit, camera, part)[0]
+        return _read(arranged(scan, K, depth_unit, camera, unit), unit, camera, part)[0]
 
     @overload
     def detect(
@@ -138,10 +161,15 @@ class PoseEstimator:
         part: Part,
         scan: ScanSource | Scene,
         camera: str | Path | None = None,
-        unit: str | None = None,
+        unit: Unit | Literal["auto"] | None = None,
         at: Float[np.ndarray, "*k 3"] | None = None,
         *,
+        K: CameraMatrix | None = None,
+        depth_unit: Unit | float | None = None,
         sensor: Float[np.ndarray, "3"] | None = None,
+        T_scene_camera: ArrayInput | None = None,
+        T_base_camera: ArrayInput | None = None,
+        grasps: GraspSource | Sequence[GraspSource | None] | None = None,
         background: ForegroundOptions | None = None,
         random_seed: int = 0,
         top: int | None = None,
@@ -154,10 +182,15 @@ class PoseEstimator:
         part: Sequence[Part],
         scan: ScanSource | Scene,
         camera: str | Path | None = None,
-        unit: str | None = None,
+        unit: Unit | Literal["auto"] | None = None,
         at: Float[np.ndarray, "*k 3"] | None = None,
         *,
+        K: CameraMatrix | None = None,
+        depth_unit: Unit | float | None = None,
         sensor: Float[np.ndarray, "3"] | None = None,
+        T_scene_camera: ArrayInput | None = None,
+        T_base_camera: ArrayInput | None = None,
+        grasps: GraspSource | Sequence[GraspSource | None] | None = None,
         background: ForegroundOptions | None = None,
         random_seed: int = 0,
         top: int | None = None,
@@ -169,10 +202,15 @@ class PoseEstimator:
         part: Part | Sequence[Part],
         scan: ScanSource | Scene,
         camera: str | Path | None = None,
-        unit: str | None = None,
+        unit: Unit | Literal["auto"] | None = None,
         at: Float[np.ndarray, "*k 3"] | None = None,
         *,
+        K: CameraMatrix | None = None,
+        depth_unit: Unit | float | None = None,
         sensor: Float[np.ndarray, "3"] | None = None,
+        T_scene_camera: ArrayInput | None = None,
+        T_base_camera: ArrayInput | None = None,
+        grasps: GraspSource | Sequence[GraspSource | None] | None = None,
         background: ForegroundOptions | None = None,
         random_seed: int = 0,
         top: int | None = None,
@@ -180,12 +218,19 @@ class PoseEstimator:
     ) -> Detections | tuple[Detections, ...]:
         """Return the copies of a part in a scan, in pick order; of several parts, one result for each.
 
-        `scan` is a file, points (n, 3) in the sensor's frame, a `Scan`, or a `Scene` that was made of one; then what
-        says how to read it is not given again. `unit` is that of its lengths, by default what its format states, else
-        the part's; an image of a BOP dataset needs neither it nor a camera. `at` restricts the search to places (k, 3)
-        in the scan's frame: each has one pose or none. `sensor` is where the scan was measured from, by default the
-        origin of its frame; `background` says what is no part; `top` keeps the first poses only; `clock` has timed what
-        came before. The same inputs and `random_seed` give the same bits on one device.
+        `scan` is a file, points (n, 3) or (h, w, 3), a depth image (h, w) with `K`, a `Scan`, or a `Scene` that was
+        made of one; then what says how to read it is not given again. Points are in the camera's frame, unless
+        `T_scene_camera` is its pose in theirs, z forward, or `sensor` its place. `K` are intrinsics (3, 3), or fx, fy,
+        cx, cy, and `depth_unit` is the unit of a depth image and of its result: mm of whole numbers and m of fractions
+        unless given, or how many metres one step is. `unit` is that of all other scans' lengths, by default what the
+        format states, else the part's; an image of a BOP dataset needs neither it nor `camera`, a file of intrinsics.
+
+        `T_base_camera`, in the result's unit, is the camera's pose in a robot's frame: each copy then has a
+        `T_base_object`. `grasps`, a file or one for each part, gives each copy those of them that are free (see
+        docs/grasps.md). `at` restricts the search to places (k, 3) in the scan's frame: each has one pose or none.
+        `background` says what is no part; `top` keeps the first poses only; `clock` has timed what came before. Where
+        poses of several parts would stand in one place, the more probable one stays. The same inputs and `random_seed`
+        give the same bits on one device.
 
         Raises InputError if lengths of part and scan cannot belong together, if nothing of the scan is foreground, or
         if nothing was measured near to one of the places.
@@ -201,35 +246,52 @@ class PoseEstimator:
         if not 0 <= random_seed <= _MOST_SEED:
             raise InputError(f"random_seed is {random_seed}, but must be between 0 and {_MOST_SEED}")
         clock = clock or Clock()
-        places = _places(at)
+        places, ways = _places(at), grasps_of(grasps, len(parts))
         if isinstance(scan, Scene):
-            if (camera, unit, sensor, background) != (None, None, None, None):
-                raise InputError("camera, unit, sensor and background were settled when the scene was made")
+            given = (camera, unit, K, depth_unit, sensor, T_scene_camera, background)
+            if any(value is not None for value in given):
+                raise InputError(
+                    "camera, unit, K, depth_unit, sensor, T_scene_camera and background were settled when the scene was"
+                    " made"
+                )
             scene = scan
         else:
             with clock("scene"):
                 scene = self.scene(
-                    scan, parts, unit=unit, camera=camera, sensor=sensor, at=places, background=background
+                    scan,
+                    parts,
+                    unit=unit,
+                    camera=camera,
+                    K=K,
+                    depth_unit=depth_unit,
+                    sensor=sensor,
+                    T_scene_camera=T_scene_camera,
+                    at=places,
+                    background=background,
                 )
+        T_base_scene = base_from_scene(T_base_camera, scene.T_scene_sensor, scene.is_opengl)
+        parts = [one.in_unit(scene.unit) for one in parts]
+        centred = [one.centred() for one in parts]
         if places is not None:
             places = into(scene.T_scene_camera, places)
-            _check_near(scene, places, max(one.in_unit(scene.unit).diameter for one in parts))
+            _check_near(scene, places, max(one.diameter for one in parts))
+        settings = {"scene": scene.source, "seed": random_seed, "weights": self.weights, "model": self.digest}
         results = []
-        for one in parts:
-            inside = one.in_unit(scene.unit)
-            found = detect(
-                self.model,
-                self.probabilities,
-                inside.centred(),
-                scene,
-                random_seed,
-                self.config,
-                places,
-                clock,
-            )
-            poses = tuple(_of_own_frame(pose, inside.origin) for pose in found.poses[:top])
-            results.append(replace(found, poses=poses))
+        for one in centred:
+            found = detect(self.model, self.probabilities, one, scene, random_seed, self.config, places, clock)
+            results.append(replace(found, settings=settings))
             clock = Clock()
+        if len(parts) > 1:
+            results = list(apart(results, centred))
+        for number, found in enumerate(results):
+            poses = tuple(_of_own_frame(pose, parts[number].origin) for pose in found.poses[:top])
+            found = replace(found, poses=poses)
+            way, clock = ways[number], Clock()
+            if way is not None:
+                with clock("grasps"):
+                    found = with_grasps(found, way, parts[number], scene, T_base_scene)
+                found = replace(found, timing=found.timing.and_then(clock.timing))
+            results[number] = found if T_base_scene is None else in_base(found, T_base_scene)
         return results[0] if isinstance(part, Part) else tuple(results)
 
 
@@ -240,6 +302,11 @@ def _of_own_frame(pose: Detection, origin: Float[np.ndarray, "3"]) -> Detection:
     T = pose.T_scene_object.copy()
     T[:3, 3] -= T[:3, :3] @ origin
     return replace(pose, T_scene_object=T)
+
+
+def _points_of(empty: Scan, scene: Scene) -> Float[np.ndarray, "e 3"]:
+    """Return the points of an empty bin in the camera's frame and the scene's unit."""
+    return into(scene.T_scene_camera, empty.in_unit(scene.unit).points).astype(np.float32)
 
 
 def _places(at: Float[np.ndarray, "*k 3"] | None) -> Float[np.ndarray, "k 3"] | None:
@@ -284,22 +351,3 @@ def _read(
     if not real.any():
         raise InputError(f"none of the scan's {len(single)} points was measured: all are NaN, infinite or zero")
     return Scan(held(np.asarray(source)[real]), None, None, None, resolve_unit(asked, part.unit)), None, nothing
-
-
-def _object(source: PartSource, unit: str | None, name: str | None) -> ObjectModel:
-    config = ObjectConfig(num_points=_NUM_POINTS)
-    if isinstance(source, str | Path):
-        return load_object(source, unit, config)
-    unit, name = check_unit(unit or "mm"), name or "part"
-    if not isinstance(source, np.ndarray):
-        if hasattr(source, "vertices") and hasattr(source, "faces"):
-            source = (source.vertices, source.faces)
-        if not isinstance(source, tuple) or len(source) != 2:
-            raise InputError(f"an object cannot be made of a {type(source).__name__}: give a file, a cloud or a mesh")
-        vertices, triangles = (np.asarray(array) for array in source)
-        return object_from_mesh(name, vertices.astype(np.float64), triangles.astype(np.int64), unit, config)
-    cloud = np.asarray(source)
-    if cloud.ndim != 2 or cloud.shape[1] not in (3, 6):
-        raise InputError(f"the object's cloud has shape {cloud.shape}, but must be (n, 3), or (n, 6) with normals")
-    normals = cloud[:, 3:].astype(np.float64) if cloud.shape[1] == 6 else None
-    return object_from_cloud(name, cloud[:, :3].astype(np.float64), normals, unit, config)

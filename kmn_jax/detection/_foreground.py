@@ -28,7 +28,7 @@ Box = tuple[float, float, float, float, float, float]
 _BEHIND = 0.15  # share of the points: with more behind it, a plane is no floor, but the tops of parts, or a rim
 _LEFT = 0.01  # share of the points in front of a floor without which it may be the parts themselves
 _PLANES = 3  # one behind the other, among which a floor is looked for
-_HINT = ": if it is the floor, give a region of interest or the empty bin"
+_HINT = ": if it is the floor, give a region of interest (--roi) or the empty bin (--background)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +187,7 @@ def _floor(
             break
         if behind <= _BEHIND and before < _LEFT:
             text = f"a plane with {share:.0%} of the points was kept, as only {before:.1%} lie in front of it: if it"
-            return None, plane, f"{text} is the floor, have it always removed"
+            return None, plane, f"{text} is the floor, say --plane always"
         if behind <= _BEHIND:
             return plane, kept, kept_text and f"{kept_text} was kept, in front of the one that was taken away{_HINT}"
         kept = kept or plane

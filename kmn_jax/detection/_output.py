@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from kmn_jax.bop import BopEstimate, write_results
-from kmn_jax.detection._result import SCHEMA_VERSION, Detection, Detections
+from kmn_jax.detection._result import Detection, Detections
 from kmn_jax.files import write_whole
 from kmn_jax.units import place_text
 
@@ -19,38 +19,7 @@ _COLUMNS = ("rank", "probability", "visible", "gap", "inliers", "x", "y", "z", "
 
 def as_json(found: Detections, object_name: str, scene_name: str, facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return a result as JSON values, see docs/detect.md; `facts`, such as the command's settings, are added."""
-    return {
-        "version": SCHEMA_VERSION,
-        "unit": found.unit,
-        "object": object_name,
-        "scene": scene_name,
-        "poses": [_pose_json(pose) for pose in found.poses],
-        "timing": {
-            "total_s": found.timing.total,
-            "compile_s": found.timing.compile,
-            **{f"{stage}_s": seconds for stage, seconds in found.timing.stages.items()},
-        },
-        "reason": found.reason,
-        "unexplained": found.unexplained,
-        "warnings": list(found.warnings),
-        **facts,
-    }
-
-
-def _pose_json(pose: Detection) -> dict[str, Any]:
-    return {
-        "T_scene_object": pose.T_scene_object.tolist(),
-        "probability": pose.probability,
-        "inliers": pose.num_inliers,
-        "visible_fraction": pose.visible_fraction,
-        "runner_up_gap": pose.runner_up_gap,
-        "explained": pose.explained,
-        "violated": pose.violated,
-        "occluded": pose.occluded,
-        "unknown": pose.unknown,
-        "seed": pose.seed.tolist(),
-        "warnings": list(pose.warnings),
-    }
+    return {**found.to_dict(), "object": object_name, "scene": scene_name, **facts}
 
 
 def write_json(found: Mapping[str, Any], path: str | Path) -> None:
@@ -75,9 +44,14 @@ def table(found: Detections, accepted: float) -> str:
     lines = [f"note: {warning}" for warning in found.warnings]
     if found.poses:
         likely = sum(pose.probability >= accepted for pose in found.poses)
-        lines.append(f"{found.part}: {likely} found, {len(found.poses) - likely} doubtful (lengths in {found.unit})")
+        frame = "" if found.poses[0].T_base_object is None else ", in the robot's frame"
+        doubtful = f"{len(found.poses) - likely} doubtful"
+        lines.append(f"{found.part}: {likely} found, {doubtful} (lengths in {found.unit}{frame})")
         rows = [_COLUMNS, *(_row(rank, pose, found.unit) for rank, pose in enumerate(found.poses, start=1))]
-        widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
+        if found.poses[0].grasps is not None:
+            last = ("grasps", *(str(len(pose.grasps or ())) for pose in found.poses))
+            rows = [(*row, cell) for row, cell in zip(rows, last, strict=True)]
+        widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
         lines += ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
         lines += sorted({f"note: {warning}" for pose in found.poses for warning in pose.warnings})
     else:
@@ -91,9 +65,10 @@ def table(found: Detections, accepted: float) -> str:
 
 
 def _row(rank: int, pose: Detection, unit: str) -> tuple[str, ...]:
-    turn = ", ".join(f"{angle:.1f}" for angle in np.degrees(_rotation_vector(pose.T_scene_object[:3, :3])))
+    shown = pose.T_scene_object if pose.T_base_object is None else pose.T_base_object
+    turn = ", ".join(f"{angle:.1f}" for angle in np.degrees(_rotation_vector(shown[:3, :3])))
     numbers = (f"{pose.probability:.2f}", f"{pose.visible_fraction:.2f}", f"{pose.runner_up_gap:.2f}")
-    return (str(rank), *numbers, str(pose.num_inliers), *place_text(pose.T_scene_object[:3, 3], unit), turn)
+    return (str(rank), *numbers, str(pose.num_inliers), *place_text(shown[:3, 3], unit), turn)
 
 
 def _rotation_vector(rotation: np.ndarray) -> np.ndarray:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 SCHEMA_VERSION = 1  # of the JSON form, see docs/detect.md
+_SHOWN = 12  # poses in what is printed of a result: it should fit on a screen
 
 
 @dataclass(frozen=True)
@@ -20,6 +23,25 @@ class CropPrediction:
 
 
 @dataclass(frozen=True)
+class Pick:
+    """A grasp of a found copy at which the gripper touches nothing that was measured."""
+
+    name: str  # of the grasp, by its file
+    width: float  # between the fingers
+    T_scene_grasp: Float[np.ndarray, "4 4"]
+    T_base_grasp: Float[np.ndarray, "4 4"] | None = None  # in the robot's frame, if that is known
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON values, see docs/grasps.md."""
+        return {
+            "name": self.name,
+            "width": self.width,
+            "T_scene_grasp": self.T_scene_grasp.tolist(),
+            "T_base_grasp": None if self.T_base_grasp is None else self.T_base_grasp.tolist(),
+        }
+
+
+@dataclass(frozen=True, repr=False)
 class Detection:
     """One found copy of a part.
 
@@ -38,6 +60,35 @@ class Detection:
     seed: Float[np.ndarray, "3"]  # the scene point around which the pose was searched
     prediction: CropPrediction
     warnings: tuple[str, ...] = ()
+    T_base_object: Float[np.ndarray, "4 4"] | None = None  # in the robot's frame, if T_base_camera was given
+    grasps: tuple[Pick, ...] | None = None  # in their file's order; None if no grasps were given
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON values, see docs/detect.md."""
+        return {
+            "T_scene_object": self.T_scene_object.tolist(),
+            "probability": self.probability,
+            "inliers": self.num_inliers,  # as it is called by those who read version 1 of the schema
+            "num_inliers": self.num_inliers,
+            "visible_fraction": self.visible_fraction,
+            "runner_up_gap": self.runner_up_gap,
+            "explained": self.explained,
+            "violated": self.violated,
+            "occluded": self.occluded,
+            "unknown": self.unknown,
+            "seed": self.seed.tolist(),
+            "warnings": list(self.warnings),
+            "T_base_object": None if self.T_base_object is None else self.T_base_object.tolist(),
+            "grasps": None if self.grasps is None else [pick.to_dict() for pick in self.grasps],
+        }
+
+    def __repr__(self) -> str:
+        x, y, z = self.T_scene_object[:3, 3]
+        grasps = "" if self.grasps is None else f", grasps {len(self.grasps)}"
+        return (
+            f"Detection(probability {self.probability:.2f}, visible {self.visible_fraction:.2f},"
+            f" at {x:.4g}, {y:.4g}, {z:.4g}{grasps})"
+        )
 
 
 @dataclass(frozen=True)
@@ -52,8 +103,12 @@ class Timing:
         """Seconds in all."""
         return self.compile + sum(self.stages.values())
 
+    def and_then(self, later: Timing) -> Timing:
+        """Return both together."""
+        return Timing({**self.stages, **later.stages}, self.compile + later.compile)
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Detections:
     """The copies of a part in a scene, in pick order: likely and unhidden ones first."""
 
@@ -65,3 +120,38 @@ class Detections:
     warnings: tuple[str, ...] = field(default_factory=tuple)  # about the scene
     unexplained: float | None = None  # share of the foreground on no pose that counts as found; None: of places alone
     unexplained_points: Float[np.ndarray, "u 3"] | None = None  # those points, in the scene's frame
+    settings: Mapping[str, Any] = field(default_factory=dict)  # what it was made with, see `to_dict`
+
+    @property
+    def best(self) -> Detection | None:
+        """The pose to pick first, None if nothing was found."""
+        return self.poses[0] if self.poses else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON values, those of `kmn detect --json`: see docs/detect.md.
+
+        `object` is the part's name, where the command writes its file; `scene` is None of arrays.
+        """
+        return {
+            "version": SCHEMA_VERSION,
+            "unit": self.unit,
+            "object": self.part,
+            "scene": None,
+            "poses": [pose.to_dict() for pose in self.poses],
+            "timing": {
+                "total_s": self.timing.total,
+                "compile_s": self.timing.compile,
+                **{f"{stage}_s": seconds for stage, seconds in self.timing.stages.items()},
+            },
+            "reason": self.reason,
+            "unexplained": self.unexplained,
+            "warnings": list(self.warnings),
+            **self.settings,
+        }
+
+    def __repr__(self) -> str:
+        lines = [f"Detections({self.part}: {len(self.poses)} poses, lengths in {self.unit})"]
+        lines += [f"{rank:4d}. {pose!r}" for rank, pose in enumerate(self.poses[:_SHOWN], start=1)]
+        lines += [f"      and {len(self.poses) - _SHOWN} more"] if len(self.poses) > _SHOWN else []
+        lines += [f"      nothing found, because {self.reason}"] if not self.poses else []
+        return "\n".join([*lines, *(f"      note: {warning}" for warning in self.warnings)])

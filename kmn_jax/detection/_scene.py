@@ -44,6 +44,10 @@ class Scene:
     doubt: str | None = None  # about its unit, told if nothing is found
     truth: tuple[Float[np.ndarray, "4 4"], ...] | None = None  # T_scene_object of all copies, if a dataset says
     bop_ids: tuple[int, int, int] = (0, 0, 1)  # scene, image and object, of an image of a BOP dataset
+    T_scene_sensor: Float[np.ndarray, "4 4"] | None = None  # of the camera as its user knows it, if that is known
+    is_opengl: bool = False  # whether its frame seems to be one of OpenGL
+    source: str | None = None  # the file
+    empty: Float32[np.ndarray, "e 3"] | None = None  # points of the empty bin in the camera's frame, if there is one
 
     def placed(self, points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s 3"]:
         """Return points of the camera's frame in the scene's: in float32, or float64 if that lies far away."""

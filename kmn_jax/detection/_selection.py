@@ -15,8 +15,8 @@ from kmn_jax.geometry import compose, inverse, squared_distances, transform_poin
 from kmn_jax.pose import mssd
 from kmn_jax.typing import Normals, Points, Pose, Scalar
 
-_DEPTH = 0.05  # diameters: a point so far below another part's surface is inside of it
-_OVERLAP = 0.15  # share of a part's points that may be inside of another part, or on the same surface
+DEPTH = 0.05  # diameters: a point so far below another part's surface is inside of it
+OVERLAP = 0.15  # share of a part's points that may be inside of another part, or on the same surface
 _CONTEST = 0.1  # difference of scores up to which another pose may turn out to be better
 _POINTS = 128  # on the surface, that are compared
 _ALIKE = 0.5  # cosine of normals
@@ -59,7 +59,7 @@ def select(
         near = (apart[row] <= 2 * diameter) & one_each
 
         def clash(pose: Pose) -> Bool[Array, ""]:
-            return overlap(poses[row], pose, points, normals, spacing, _DEPTH * diameter) > _OVERLAP
+            return overlap(poses[row], pose, points, normals, spacing, DEPTH * diameter) > OVERLAP
 
         return map_real(clash, near, poses)
 
@@ -99,25 +99,31 @@ def overlap(pose: Pose, other: Pose, points: Points, normals: Normals, spacing: 
     `spacing` is how far the points are apart.
     """
 
-    offsets = (points * normals).sum(axis=1)
-
     def share(pose: Pose, other: Pose) -> Scalar:
-        between = compose(inverse(other), pose)
-        seen = transform_points(between, points)
-        away = jnp.sqrt(squared_distances(seen, points))
-        nearest = away.min(axis=1, keepdims=True)
-        highest = jax.lax.Precision.HIGHEST
-        heights = jnp.matmul(seen, normals.T, precision=highest) - offsets[None]
-        # Beyond an edge a point is below one face, but not below all that are about as near.
-        height = jnp.where(away <= nearest + spacing, heights, -jnp.inf).max(axis=1)
-        row = jnp.argmin(away, axis=1)
-        turned = jnp.matmul(normals, between[:3, :3].T, precision=highest)
-        alike = (turned * normals[row]).sum(axis=1) > _ALIKE  # where parts touch, they are opposite
-        flush = jnp.abs(heights[jnp.arange(len(row)), row]) <= depth
-        on = flush & (nearest[:, 0] <= depth + spacing) & alike
-        return ((height < -depth) | on).mean()
+        return share_inside(compose(inverse(other), pose), (points, normals), (points, normals), spacing, depth)
 
     return jnp.maximum(share(pose, other), share(other, pose))
+
+
+def share_inside(
+    T_other_own: Pose, own: tuple[Points, Normals], other: tuple[Points, Normals], spacing: Scalar, depth: Scalar
+) -> Scalar:
+    """Return which share of the points of one part is in or on another one; see `overlap`."""
+    points, normals = other
+    offsets = (points * normals).sum(axis=1)
+    seen = transform_points(T_other_own, own[0])
+    away = jnp.sqrt(squared_distances(seen, points))
+    nearest = away.min(axis=1, keepdims=True)
+    highest = jax.lax.Precision.HIGHEST
+    heights = jnp.matmul(seen, normals.T, precision=highest) - offsets[None]
+    # Beyond an edge a point is below one face, but not below all that are about as near.
+    height = jnp.where(away <= nearest + spacing, heights, -jnp.inf).max(axis=1)
+    row = jnp.argmin(away, axis=1)
+    turned = jnp.matmul(own[1], T_other_own[:3, :3].T, precision=highest)
+    alike = (turned * normals[row]).sum(axis=1) > _ALIKE  # where parts touch, they are opposite
+    flush = jnp.abs(heights[jnp.arange(len(row)), row]) <= depth
+    on = flush & (nearest[:, 0] <= depth + spacing) & alike
+    return ((height < -depth) | on).mean()
 
 
 select_poses = jax.jit(select)

@@ -33,6 +33,7 @@ _POINTS_ACROSS = 3.0
 # What is usual; it only ranks units that can be. First in diameters, then in metres.
 _USUAL_EXTENT, _USUAL_DISTANCE = (0.7, 20.0), (3.0, 40.0)
 _USUAL_SIZES = {"object": (0.003, 0.5), "scene": (0.03, 2.0), "distance": (0.15, 3.0)}
+_REAL_SIZES = (0.0005, 5.0)  # of an object: others bring a question
 _RARE = {"mm": 0.0, "m": 0.2, "in": 0.7, "cm": 1.0}
 _RARE_MISTAKE = {"scene": 0.0, "object": 0.5}
 _DOUBTFUL = 2.5  # units that are more unusual by less may be what a user means where nothing is found
@@ -112,7 +113,10 @@ def length_problem(diameter: float, object_unit: str, scene: SceneSize) -> str |
     change = f"{factor:.4g} times larger" if factor > 1 else f"{1 / factor:.4g} times smaller"
     others = ", ".join(f"{_NAMES[name]} for the {what}" for oddity, what, name in rest if oddity < least + _CLOSE)
     too = f" ({others} would fit, too)" if others else ""
-    say = f"say --{'units' if which == 'scene' else 'object-units'} {unit}"
+    say = f"say --units {unit}"
+    if which == "object":
+        again = f"a card is made again by kmn prepare --units {unit}, a GLB or STEP file is to be exported again"
+        say = f"say --object-units {unit} ({again})"
     return f"{fault}: the {which} would fit {change}, so its lengths are probably {_NAMES[unit]}{too}: {say}"
 
 
@@ -130,6 +134,17 @@ def length_doubt(diameter: float, object_unit: str, scene: SceneSize) -> str | N
         return None
     names = " or ".join(_NAMES[unit] for unit in units)
     return f"if the scan's lengths are {names}, not {_NAMES[scene.unit]}, say --units {' or '.join(units)}"
+
+
+def size_question(diameter: float, unit: str, flag: str) -> str | None:
+    """Ask whether an object is really so small or large, None if many are; `flag` is what says the unit otherwise."""
+    metres = diameter * METRES[check_unit(unit)]
+    if _REAL_SIZES[0] <= metres <= _REAL_SIZES[1]:
+        return None
+    low, high = _USUAL_SIZES["object"]
+    likely = sorted((_RARE[other], other) for other in METRES if low <= diameter * METRES[other] <= high)
+    remedy = f" If its numbers are {_NAMES[likely[0][1]]}, say {flag} {likely[0][1]}" if likely else ""
+    return f"is the object really {_digits(diameter)} {unit} large?{remedy}"
 
 
 def _fault(diameter: float, object_unit: str, scene: SceneSize) -> str | None:

@@ -4,6 +4,16 @@ Three functions share the name of their module (`kabsch`, `ransac`, `icp`): as a
 names are the functions.
 """
 
+from kmn_jax.pose._accuracy import (
+    LEFT_OUT,
+    RIGHT,
+    THRESHOLDS,
+    WRONG,
+    average_precision,
+    average_recall,
+    match_copies,
+    symmetric_pose_error,
+)
 from kmn_jax.pose._icp import IcpConfig, icp
 from kmn_jax.pose._kabsch import kabsch
 from kmn_jax.pose._matches import MatchConfig, Matches, find_matches
@@ -21,6 +31,10 @@ from kmn_jax.pose._result import PoseResult, PoseStatus
 from kmn_jax.pose._surface import SurfaceAgreement, SurfaceConfig, surface_agreement
 
 __all__ = [
+    "LEFT_OUT",
+    "RIGHT",
+    "THRESHOLDS",
+    "WRONG",
     "IcpConfig",
     "MatchConfig",
     "Matches",
@@ -31,15 +45,19 @@ __all__ = [
     "SurfaceConfig",
     "add",
     "adi",
+    "average_precision",
+    "average_recall",
     "bounding_box_diagonal",
     "diameter",
     "discretise_symmetry",
     "find_matches",
     "icp",
     "kabsch",
+    "match_copies",
     "mssd",
     "ransac",
     "ransac_modes",
     "recall",
     "surface_agreement",
+    "symmetric_pose_error",
 ]

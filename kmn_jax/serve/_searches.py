@@ -27,6 +27,7 @@ from kmn_jax.detection import (
 from kmn_jax.errors import InputError, number_list
 from kmn_jax.objects import Part
 from kmn_jax.serve._parts import PartStore
+from kmn_jax.units import check_unit
 
 _MOST_PICTURES = 16  # the last ones, which can be fetched
 _PIECE = 1 << 20  # bytes
@@ -84,7 +85,7 @@ class Searches:
     def prepare(self, upload: Upload, units: str) -> Part:
         """Make a part of a CAD file, a cloud or a card."""
         with self._written(upload, "part") as path:
-            return self.estimator.prepare(path, None if units == "auto" else units)
+            return self.estimator.prepare(path, None if units == "auto" else check_unit(units))
 
     def part_of(self, upload: Upload, units: str) -> tuple[str, Part]:
         """Make a part of a file that came with a scan, or remember it; return also what it is called from then on."""
@@ -120,15 +121,16 @@ class Searches:
             region = OrientedBox.of_numbers(region)
         sensor = None if asked.sensor is None else np.array(number_list(asked.sensor, "sensor", 3))
         at = np.array(places) if places else None
+        units = None if asked.units == "auto" else check_unit(asked.units)
         with self._written(asked.camera, "camera") as camera:
             empty = None
             if asked.background is not None:
                 with self._written(asked.background, "background") as path:
-                    empty = self.estimator.read(path, part, asked.units, camera)
+                    empty = self.estimator.read(path, part, units, camera)
             options = ForegroundOptions(empty, region, asked.plane)
             with self._written(asked.scene, "scene") as path:
                 scene = self.estimator.scene(
-                    path, part, unit=asked.units, camera=camera, sensor=sensor, at=at, background=options
+                    path, part, unit=units, camera=camera, sensor=sensor, at=at, background=options
                 )
         return scene, at
 

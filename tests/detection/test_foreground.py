@@ -141,13 +141,14 @@ def test_tops_that_hide_most_of_the_floor_are_kept() -> None:
     scan, _ = plates(3)
     kept, (warning,) = foreground(scan, DIAMETER)
     assert kept.all()
-    assert "was kept, as many lie behind it: if it is the floor, give a region of interest or the empty bin" in warning
+    assert "was kept, as many lie behind it: if it is the floor, give a region of interest (--roi)" in warning
 
 
 def test_a_single_plane_is_not_thrown_away_unasked() -> None:
     scan = as_scan(floor_depth(AWAY))
     kept, (warning,) = foreground(scan, DIAMETER)
     assert kept.all()
+    assert warning.endswith("if it is the floor, say --plane always")
     assert "of the points was kept, as only 0.0% lie in front of it" in warning
     with pytest.raises(InputError, match="lie in one plane or behind it: if they show objects, keep the plane"):
         foreground(scan, DIAMETER, ForegroundOptions(remove_plane="always"))

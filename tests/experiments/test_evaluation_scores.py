@@ -13,7 +13,16 @@ from experiments.evaluation.configs import noise_name
 from experiments.evaluation.predictions import Export, Predictions
 from experiments.evaluation.published import RECALL
 from experiments.evaluation.report import beaten_by
-from experiments.evaluation.scores import Cell, cells_of, object_rows, pooled, recall_rows, seed_rows, wilson
+from experiments.evaluation.scores import (
+    Cell,
+    accuracy_rows,
+    cells_of,
+    object_rows,
+    pooled,
+    recall_rows,
+    seed_rows,
+    wilson,
+)
 from kmn_jax.errors import InputError
 from kmn_jax.objects import ObjectModel
 from tests.bop.bop_sample import box_model
@@ -63,6 +72,25 @@ def test_a_pose_is_right_on_any_copy_and_only_within_the_gate(exported: Export, 
     np.testing.assert_array_equal(coarse.on_seed, [True, True, True, True, False, False])
     assert refined.recall() == pytest.approx(5 / 6)
     np.testing.assert_allclose(refined.seconds, 2 * coarse.seconds)
+
+
+def test_how_exact_poses_are(exported: Export, model: ObjectModel) -> None:
+    coarse, _ = cells_of(exported, {"box": model}, {"ours": "kmn_jax"}, [NOISE])
+    off = coarse.offsets
+    assert off is not None
+    right = coarse.errors < 0.1
+    np.testing.assert_allclose(off.millimetres[right], 0, atol=1e-3 * model.diameter)
+    np.testing.assert_allclose(off.degrees[right], 0, atol=0.05)
+    np.testing.assert_allclose([off.shares[3], off.mssd[3]], 0.25, atol=1e-3)
+    assert off.millimetres[3] == pytest.approx(0.25 * model.diameter, rel=1e-3)
+    assert all(np.isinf(column[5]) for column in off)
+    (row,) = accuracy_rows([pooled([coarse, coarse], "all")], NOISE)
+    assert row["MSSD recall"] == "0.67"
+    # Four of six are below all thresholds, one of them from 0.3 on.
+    assert row["MSSD recall, BOP"] == f"{(4 + 0.5) / 6:.2f}"
+    assert all(float(text) < 0.1 for text in row["shifted, % of the diameter"].split(" / "))
+    assert accuracy_rows([cell("FPFH", "a", 9)], 0.0) == []
+    assert accuracy_rows([coarse], 0.5) == []
 
 
 def test_the_gate_by_the_diagonal_is_the_wider_one(model: ObjectModel) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.bins import WorldImage, world_images
+from experiments.bins import LEAST_VISIBLE, WorldImage, world_images
 from experiments.detect_bins import Tally
 from experiments.detect_worlds import WorldTally
 from experiments.test_sets import SPLIT
@@ -95,3 +95,9 @@ def test_counts(folder: Path, model: Model) -> None:
     assert row["first right"] == 1
     assert row["right from 0.9 on"] == 0.5
     assert (row["searched in vain"], row["accepted there"]) == (2, 1)
+    copies, seen = tally.found.copies, bool(present.visible[0] >= LEAST_VISIBLE)
+    assert row["MSSD recall"] == pytest.approx(seen / copies)
+    # The most probable pose is right, all others are wrong: precision is 1 up to a recall of one copy.
+    assert row["average precision"] == pytest.approx(seen * (100 // copies + 1) / 101)
+    assert row["shifted, mm, median"] == pytest.approx(0, abs=1e-3)
+    assert row["turned, degrees, 90%"] == pytest.approx(0, abs=0.1)

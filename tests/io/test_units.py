@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from kmn_jax.errors import InputError
-from kmn_jax.io import DepthCamera, Scan, depth_scan, length_doubt, length_problem, resolve_unit, scene_size
+from kmn_jax.io import (
+    DepthCamera,
+    Scan,
+    depth_scan,
+    length_doubt,
+    length_problem,
+    resolve_unit,
+    scene_size,
+    size_question,
+    stated_unit,
+)
 from kmn_jax.io._scale import SceneSize
 from kmn_jax.units import METRES
 
@@ -61,7 +72,7 @@ def test_an_object_in_metres_read_as_millimetres(name: str) -> None:
     found = length_problem(in_unit(RIGHT[name][0], "m"), "mm", scene(RIGHT[name], "mm"))
     assert found is not None
     assert "the object would fit 1000 times larger, so its lengths are probably metres" in found
-    assert found.endswith("say --object-units m")
+    assert "say --object-units m (a card is made again by kmn prepare --units m, a GLB or STEP file" in found
 
 
 def test_the_sentence_as_a_whole() -> None:
@@ -71,7 +82,8 @@ def test_the_sentence_as_a_whole() -> None:
     )
     assert length_problem(60 / 25.4, "mm", scene(MOTOR, "mm")) == (
         "the object of 2.36 mm is far too small for the scene of 500 mm: the object would fit 25.4 times larger, so its"
-        " lengths are probably inches (centimetres for the object would fit, too): say --object-units in"
+        " lengths are probably inches (centimetres for the object would fit, too): say --object-units in (a card is"
+        " made again by kmn prepare --units in, a GLB or STEP file is to be exported again)"
     )
 
 
@@ -182,3 +194,34 @@ def test_clouds_are_measured_alike_however_large(monkeypatch: pytest.MonkeyPatch
     one = scene_size(Scan(grid[:1], None, None, None, "mm"))
     assert (one.extent, one.spacing) == (0, 0)
     assert length_problem(60.0, "mm", one) is not None
+
+
+def test_an_object_of_an_odd_size_brings_a_question() -> None:
+    assert size_question(0.058, "mm", "--units") == (
+        "is the object really 0.058 mm large? If its numbers are metres, say --units m"
+    )
+    assert size_question(60_000.0, "cm", "--object-units") == "is the object really 60000 cm large?"
+    for diameter, unit in ((58.0, "mm"), (0.058, "m"), (2.0, "in"), (0.6, "mm"), (4.0, "m")):
+        assert size_question(diameter, unit, "--units") is None
+
+
+@pytest.mark.parametrize(
+    ("content", "unit"),
+    [
+        (b"#1=(LENGTH_UNIT()NAMED_UNIT(*)SI_UNIT(.MILLI.,.METRE.));", "mm"),
+        (b"#1=( LENGTH_UNIT() NAMED_UNIT(*) SI_UNIT( .CENTI. , .METRE. ) );", "cm"),
+        (b"#1=(NAMED_UNIT(*)SI_UNIT($,.STERADIAN.)SOLID_ANGLE_UNIT());#2=(SI_UNIT($,.METRE.));", "m"),
+        (b"#1=(SI_UNIT(.MILLI.,.METRE.));#2=(CONVERSION_BASED_UNIT('INCH',#3)LENGTH_UNIT());", "in"),
+        (b"nothing", "mm"),
+    ],
+)
+def test_a_step_file_states_its_unit(content: bytes, unit: str, tmp_path: Path) -> None:
+    (tmp_path / "part.STP").write_bytes(content)
+    assert stated_unit(tmp_path / "part.STP") == unit
+
+
+def test_other_files_state_metres_or_nothing(tmp_path: Path) -> None:
+    assert stated_unit("part.glb") == "m"
+    assert stated_unit("part.stl") is None
+    with pytest.raises(InputError, match="cannot be read"):
+        stated_unit(tmp_path / "none.step")

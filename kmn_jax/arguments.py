@@ -1,0 +1,65 @@
+"""Arguments of the command line: values that begin with a minus sign, and one sentence for what is wrong."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+from collections.abc import Callable, Iterable
+from functools import partial, wraps
+from typing import Any
+
+import tyro
+
+from kmn_jax.errors import InputError
+
+_VECTORS = ("--at", "--sensor", "--roi")  # flags whose values may begin with a minus sign
+
+
+def joined(arguments: list[str]) -> list[str]:
+    """Return arguments in which a value that begins with a minus sign is joined to its flag."""
+    result: list[str] = []
+    for argument in arguments:
+        if result and result[-1] in _VECTORS and argument.startswith("-") and "," in argument:
+            result[-1] += f"={argument}"
+        else:
+            result.append(argument)
+    return result
+
+
+def parsed(arguments: list[str], calls: Iterable[Callable[..., None]]) -> Callable[[], None]:
+    """Return the command that the arguments ask for, to be run.
+
+    Raises InputError, in one sentence, for wrong ones.
+    """
+
+    def later(call: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+        return wraps(call)(lambda *values, **named: partial(call, *values, **named))
+
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            commands: dict[str, Any] = {call.__name__: later(call) for call in calls}
+            chosen: Callable[[], None] = tyro.extras.subcommand_cli_from_dict(commands, prog="kmn", args=arguments)
+            return chosen
+    except SystemExit as error:
+        if not error.code:  # of --help
+            raise
+    raise InputError(_sentence(said.getvalue()))
+
+
+def _sentence(box: str) -> str:
+    """Return what a box of the parser says of wrong arguments in one sentence, without the help texts in it."""
+    box = re.sub(r"\x1b\[[\d;]*m", "", box)  # colours
+    lines = [line[2:-1].rstrip() for line in box.splitlines()[1:] if not line.startswith("╰")]  # below its title
+    parts: list[list[str]] = [[]]
+    for line in lines:
+        if re.fullmatch("[─-]{3,}", line):
+            parts.append([])
+        elif not line:  # what follows are details
+            break
+        elif not line.startswith(" " * 5):  # where help texts are
+            parts[-1].append(line.strip())
+    said = "; ".join(" ".join(part).rstrip(".") for part in parts if part and not part[0].startswith("For full help"))
+    helped = re.search(r"kmn(?: \w+)? --help", box)
+    return f"{said or box.strip()}: see {helped[0] if helped else 'kmn --help'}"

@@ -1,0 +1,79 @@
+"""Where the camera was in the frame of a scan, and results in a robot's frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from kmn_jax.detection._frames import into
+from kmn_jax.detection._result import Detections
+from kmn_jax.errors import InputError
+from kmn_jax.io import Scan, pose_matrix
+from kmn_jax.typing import ArrayInput
+
+_MOST_BEHIND = 0.01  # share of the points: with more behind it, the camera was not there
+_OPENGL = (
+    "all points lie at negative z, as in frames of OpenGL (y up, z backwards)",
+    "negate y and z of all points, or give T_scene_camera = diag(1, -1, -1, 1) in Python",
+)
+
+
+class ScanFrame(NamedTuple):
+    """What is known of the camera in the frame of a scan."""
+
+    T_scene_sensor: Float[np.ndarray, "4 4"] | None  # of the camera as its user knows it; None if only its place is
+    sensor: Float[np.ndarray, "3"] | None  # its place; None: the origin
+    warnings: tuple[str, ...]
+    is_opengl: bool = False
+
+
+def scan_frame(scan: Scan, sensor: Float[np.ndarray, "3"] | None, T_scene_camera: ArrayInput | None) -> ScanFrame:
+    """Return where a scan's camera was: at the origin unless a place or a pose is given.
+
+    Raises InputError for both at once, for a depth image with either, and if points lie behind the camera.
+    """
+    if T_scene_camera is None:
+        backwards = scan.camera is None and sensor is None and bool((scan.points[:, 2] < 0).all())
+        note = f"{_OPENGL[0]}: poses are given in that frame; for those in the camera's usual frame, {_OPENGL[1]}"
+        return ScanFrame(np.eye(4) if sensor is None else None, sensor, (note,) if backwards else (), backwards)
+    if sensor is not None:
+        raise InputError("T_scene_camera says where the sensor was: leave sensor out")
+    if scan.camera is not None:
+        raise InputError("a depth image is in the frame of its camera: leave T_scene_camera out")
+    pose = pose_matrix(T_scene_camera, "T_scene_camera")
+    behind = float((into(pose, scan.points)[:, 2] <= 0).mean())
+    if behind > _MOST_BEHIND:
+        raise InputError(
+            f"{behind:.0%} of the points lie behind the camera of T_scene_camera: give the camera's pose in the frame"
+            " of the points, z forward (its inverse, or axes of OpenGL, look like this)"
+        )
+    return ScanFrame(pose, pose[:3, 3], ())
+
+
+def base_from_scene(
+    T_base_camera: ArrayInput | None, T_scene_sensor: Float[np.ndarray, "4 4"] | None, is_opengl: bool
+) -> Float[np.ndarray, "4 4"] | None:
+    """Return the pose of a scan's frame in the robot's; None without `T_base_camera`.
+
+    Raises InputError if it is not known how the camera lies in the scan's frame.
+    """
+    if T_base_camera is None:
+        return None
+    pose = pose_matrix(T_base_camera, "T_base_camera")
+    if T_scene_sensor is None:
+        raise InputError(
+            "T_base_camera needs the camera's axes in the scan's frame, too: give T_scene_camera in place of the"
+            " sensor's place, or a scan in the camera's frame"
+        )
+    if is_opengl:
+        raise InputError(f"{_OPENGL[0]}, to which T_base_camera cannot be applied: {_OPENGL[1]}")
+    return pose @ np.linalg.inv(T_scene_sensor)
+
+
+def in_base(found: Detections, T_base_scene: Float[np.ndarray, "4 4"]) -> Detections:
+    """Return a result with the poses of its copies in the robot's frame, too."""
+    poses = tuple(replace(pose, T_base_object=T_base_scene @ pose.T_scene_object) for pose in found.poses)
+    return replace(found, poses=poses)
