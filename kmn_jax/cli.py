@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
     from kmn_jax.detection import Detections
-    from kmn_jax.objects import Part
     from kmn_jax.serve import ServerAnswer
     from kmn_jax.units import Unit
 
@@ -85,7 +84,7 @@ def prepare(
             theirs: of them it is the unit that the card will be in.
         weights: released network, or a .safetensors file.
     """
-    from kmn_jax.detection import PoseEstimator
+    from kmn_jax.detection import PoseEstimator, describe
     from kmn_jax.io import size_question
     from kmn_jax.objects import save_part
 
@@ -93,7 +92,7 @@ def prepare(
     check_output(target, source)
     part = PoseEstimator.from_pretrained(weights).prepare(source, _unit(units))
     save_part(part, target)
-    print(f"{part.name}: {_size(part)}, {_symmetry(part)}; wrote {target}")
+    print(f"{describe(part)}; wrote {target}")
     question = size_question(part.diameter, part.unit, "--units")
     if question is not None:
         print(f"note: {question}")
@@ -337,18 +336,6 @@ class _Session:
 
 def _unit(units: Units) -> Unit | None:
     return None if units == "auto" else units
-
-
-def _size(part: Part) -> str:
-    x, y, z = part.maximum - part.minimum
-    return f"{x:.4g} x {y:.4g} x {z:.4g} {part.unit}, diameter {part.diameter:.4g} {part.unit}"
-
-
-def _symmetry(part: Part) -> str:
-    found = part.symmetries
-    if len(found.axes):
-        return "turns about an axis look the same" if len(found.axes) == 1 else "looks the same from all sides"
-    return f"{len(found.rotations)} poses look the same" if part.is_symmetric else "no symmetry"
 
 
 def _keep_compiled() -> None:

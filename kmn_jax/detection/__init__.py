@@ -46,7 +46,7 @@ from kmn_jax.detection._foreground import ForegroundOptions, OrientedBox, foregr
 from kmn_jax.detection._frames import into, placed
 from kmn_jax.detection._grasps import Conflict, Copy, grasp_conflict, with_grasps
 from kmn_jax.detection._mapping import call_rows, map_real, map_rows
-from kmn_jax.detection._output import as_json, table, write_bop_csv, write_json
+from kmn_jax.detection._output import as_json, describe, table, write_bop_csv, write_json
 from kmn_jax.detection._picture_agreement import PictureAgreement, picture_agreement
 from kmn_jax.detection._result import CropPrediction, Detection, Detections, Pick, Timing
 from kmn_jax.detection._scene import MOST_POINTS, Scene, make_scene
@@ -117,6 +117,7 @@ __all__ = [
     "chosen",
     "depth_agreement",
     "depth_buffer",
+    "describe",
     "detect",
     "detections",
     "device_calibration",

@@ -12,6 +12,7 @@ import numpy as np
 from kmn_jax.bop import BopEstimate, write_results
 from kmn_jax.detection._result import Detection, Detections
 from kmn_jax.files import write_whole
+from kmn_jax.objects import Part
 from kmn_jax.units import place_text
 
 _COLUMNS = ("rank", "probability", "visible", "gap", "inliers", "x", "y", "z", "rotation vector (degrees)")
@@ -75,3 +76,15 @@ def _rotation_vector(rotation: np.ndarray) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
+
+
+def describe(part: Part) -> str:
+    """Return name, size and symmetry of a part for people."""
+    x, y, z = part.maximum - part.minimum
+    found = part.symmetries
+    if len(found.axes):
+        alike = "turns about an axis look the same" if len(found.axes) == 1 else "looks the same from all sides"
+    else:
+        alike = f"{len(found.rotations)} poses look the same" if part.is_symmetric else "no symmetry"
+    size = f"{x:.4g} x {y:.4g} x {z:.4g} {part.unit}, diameter {part.diameter:.4g} {part.unit}"
+    return f"{part.name}: {size}, {alike}"
