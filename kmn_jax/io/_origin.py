@@ -31,6 +31,8 @@ def object_origin(points: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3"]:
     """
     low, high = points.min(axis=0), points.max(axis=0)
     origin, size = far_origin(low, high), float(np.linalg.norm(high - low))
+    if not size:
+        return np.zeros(3)  # one place has no surface, wherever it is
     farthest = float(np.abs(origin).max())
     too_coarse = np.spacing(np.float32(farthest)) > size / _STEPS
     if farthest > _LOST * size or (too_coarse and bool((points.astype(np.float32) == points).all())):

@@ -210,6 +210,7 @@ def test_slow_clients_are_given_up_and_others_answered(server: Running) -> None:
     assert time.monotonic() - start < 10
     # One that does not take its answers is given up, too.
     lazy = opened(server, 2000 * b"GET /openapi.json HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    eventually(lambda: bool(server.server.server_state.connections))
     eventually(lambda: not server.server.server_state.connections)
     assert 0 < len(rest(lazy)) < 2000 * 10_000
 
