@@ -52,12 +52,15 @@ class DetectConfig:
     patience: int | None = 2  # rounds that find no copy, after which it is not searched finely; None goes on
     later_seeds: int = 16  # at most in a round after the first; rounds go on until the foreground is covered
     most_seeds: int = 512  # at least so many are searched before it is given up to cover the foreground
-    accepted: float = 0.5  # the probability from which on a pose explains points, and counts as found
+    likely: float = 0.5  # the probability from which on a pose, as it is found, explains points: they are done
+    accepted: float = 0.7  # that from which on a pose counts as found: in world bins 95% of such poses are right
     reported: float = 0.1  # less probable poses are left out
 
     def __post_init__(self) -> None:
         if self.patience is not None and self.patience < 1:
             raise InputError(f"patience = {self.patience} must be at least 1, or none")
+        if not 0 <= self.likely <= 1:
+            raise InputError(f"likely = {self.likely} must be a probability")
         if min(self.later_seeds, self.most_seeds) < 1 or not 0 <= self.reported <= self.accepted <= 1:
             raise InputError(
                 f"later_seeds = {self.later_seeds} and most_seeds = {self.most_seeds} must be at least 1, and reported"
@@ -136,7 +139,7 @@ def explore(
             rounds.append(propose(seeds_over(scene, free, part, config.later_seeds if rounds else NUM_SEEDS)))
         with clock("coverage"):
             found = rounds[-1]
-            likely = found.usable & (calibration.probability(found.evidence) >= config.accepted)
+            likely = found.usable & (calibration.probability(found.evidence) >= config.likely)
             state = cover(state, scene, part, found, likely, reach)
             free = to_search(state, scene, part, config.patience)
         if not free.any():
