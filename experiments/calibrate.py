@@ -1,7 +1,7 @@
 """Fit the probabilities of detections: `python -m experiments.calibrate [MODEL.safetensors]`.
 
 Poses are searched in the validation bins (`python -m experiments.build_data validation-bins`), whose objects the
-network was not trained with, and with `--worlds` in the whole scans of world bins; in each of them also a part that is
+network was not trained with, and with `--worlds` in the whole scans of world bins; in every second one also a part that is
 not there. A small model of the evidence is fitted to whether they are right. Each object's probabilities are also
 predicted by a model that was fitted without it, which gives the reliability that is printed. The model of poses as
 they are found is fitted first: it chooses which of them are refined, here as in detection.
@@ -95,7 +95,8 @@ def collect(options: Options) -> dict[str, np.ndarray]:
     config = replace(config, crops=config.crops.of_network(model.config))
     searches = list(_searches(options, model, config))
     found = [search.columns(search.found) for search in searches]
-    chooser = fit(_joined(found), 1.0, options.folds)[0]
+    every = _joined(found)
+    chooser = fit_calibration(every["evidence"], every["error"] < THRESHOLD, EVIDENCE)
     refined = [
         search.columns(refined)
         for search in tqdm(searches, unit="search", desc="refinement")
@@ -158,7 +159,7 @@ def fit(poses: dict[str, np.ndarray], absent_weight: float, folds: int) -> tuple
         others = fit_calibration(evidence[~own], right[~own], EVIDENCE, weights[~own])
         held_out[own] = others.probability(evidence[own])
     model = fit_calibration(evidence, right, EVIDENCE, weights)
-    accepted = held_out >= 0.5
+    accepted = held_out >= DetectConfig().accepted
     present = accepted & there
     summary = {
         "objects": len(names),
@@ -180,6 +181,8 @@ def calibrate(options: Options) -> dict[str, Any]:
     if options.candidates is not None and options.candidates.exists():
         with np.load(options.candidates) as stored:
             poses = dict(stored)
+        if poses["evidence"].shape[1] != len(EVIDENCE):
+            raise InputError(f"{options.candidates} holds other evidence than is gathered now: remove it")
     else:
         poses = collect(options)
         if options.candidates is not None:

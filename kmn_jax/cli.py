@@ -7,7 +7,7 @@ import os
 import shlex
 import sys
 import traceback
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -130,9 +130,7 @@ def detect(
         check_picture(save_picture)
     if server is None:
         session = _Session(request)
-        found, bop_ids = session.detect(session.places), session.scene.bop_ids
-        if top is not None:
-            found = replace(found, poses=found.poses[:top])
+        found, bop_ids = session.detect(session.places, top), session.scene.bop_ids
         facts = {"seed": request.random_seed, "weights": request.weights, "model": session.part.model_digest}
         result = as_json(found, str(request.object), str(request.scene), facts)
     else:
@@ -313,7 +311,7 @@ class _Session:
                 background=ForegroundOptions(empty, region, request.plane),
             )
 
-    def detect(self, places: Float[np.ndarray, "k 3"] | None) -> Detections:
+    def detect(self, places: Float[np.ndarray, "k 3"] | None, top: int | None = None) -> Detections:
         """Search the scan, or places of it only."""
         from kmn_jax.detection import Clock
         from kmn_jax.io import in_other_unit
@@ -330,6 +328,7 @@ class _Session:
             T_base_camera=base,
             grasps=self._grasps,
             random_seed=self._request.random_seed,
+            top=top,
             clock=clock,
         )
 

@@ -93,6 +93,7 @@ def check_output(path: Path, *read: Path | None) -> None:
 
 def safetensors_bytes(tensors: dict[str, np.ndarray], metadata: dict[str, str] | None = None) -> bytes:
     """Return the content of a .safetensors file: the same tensors and metadata make the same bytes."""
+    metadata = metadata if tensors else metadata or None  # of nothing at all, the library writes no JSON
     content = save({name: np.ascontiguousarray(array) for name, array in tensors.items()}, metadata)
     start = 8 + int.from_bytes(content[:8], "little")
     header = json.loads(content[8:start])

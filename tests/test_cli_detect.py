@@ -86,6 +86,7 @@ def test_a_bin_in_all_forms_of_output(card: Path, tmp_path: Path, capsys: pytest
         for pick in pose["grasps"]:
             assert pick["name"] == "cup"
             np.testing.assert_allclose(pick["T_base_grasp"], T_base_camera @ pick["T_scene_grasp"], atol=1e-9)
+    assert any(pose["grasps"] for pose in found["poses"])
     assert "in the robot's frame" in said.out
     assert any(line.split()[:1] == ["rank"] and line.endswith("grasps") for line in said.out.splitlines())
     rows = table(outputs["--bop-csv"])

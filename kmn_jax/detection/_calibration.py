@@ -1,4 +1,4 @@
-"""How probable it is that a pose is right, from the evidence for and against it: a logistic model with hidden units.
+"""How probable it is that a pose is right, from the evidence for and against it: a model with a few hidden units.
 
 What one number says depends on others: that a surface goes on in its plane speaks against a pose, but less so if much
 of a curved surface agrees. Hidden units learn that; ridges and the clipping of what was never seen keep them tame.

@@ -12,11 +12,12 @@ from jaxtyping import Float
 
 from kmn_jax.bop import bop_object, bop_scan, bop_scene_id, is_bop_image
 from kmn_jax.detection._calibration import Probabilities, load_probabilities
+from kmn_jax.detection._coverage import unexplained
 from kmn_jax.detection._detect import DetectConfig, detect
 from kmn_jax.detection._evidence import EVIDENCE
 from kmn_jax.detection._exclusion import apart
 from kmn_jax.detection._foreground import ForegroundOptions
-from kmn_jax.detection._frames import into
+from kmn_jax.detection._frames import into, placed
 from kmn_jax.detection._grasps import with_grasps
 from kmn_jax.detection._result import Detection, Detections
 from kmn_jax.detection._scan_frame import base_from_scene, in_base, scan_frame
@@ -245,6 +246,8 @@ class PoseEstimator:
                 )
         if not 0 <= random_seed <= _MOST_SEED:
             raise InputError(f"random_seed is {random_seed}, but must be between 0 and {_MOST_SEED}")
+        if top is not None and top < 1:
+            raise InputError(f"top is {top}, but must be at least 1")
         clock = clock or Clock()
         places, ways = _places(at), grasps_of(grasps, len(parts))
         if isinstance(scan, Scene):
@@ -282,7 +285,10 @@ class PoseEstimator:
             results.append(replace(found, settings=settings))
             clock = Clock()
         if len(parts) > 1:
-            results = list(apart(results, centred))
+            results = [
+                _told_anew(found, one, scene, self.config.accepted)
+                for found, one in zip(apart(results, centred), centred, strict=True)
+            ]
         for number, found in enumerate(results):
             poses = tuple(_of_own_frame(pose, parts[number].origin) for pose in found.poses[:top])
             found = replace(found, poses=poses)
@@ -302,6 +308,17 @@ def _of_own_frame(pose: Detection, origin: Float[np.ndarray, "3"]) -> Detection:
     T = pose.T_scene_object.copy()
     T[:3, 3] -= T[:3, :3] @ origin
     return replace(pose, T_scene_object=T)
+
+
+def _told_anew(found: Detections, part: Part, scene: Scene, accepted: float) -> Detections:
+    """Return a result, some of whose poses were left out, with what the others leave unexplained."""
+    if found.unexplained is None:
+        return found
+    T_camera_scene = np.linalg.inv(scene.T_scene_camera)
+    kept = [T_camera_scene @ pose.T_scene_object for pose in found.poses if pose.probability >= accepted]
+    left = unexplained(scene.foreground, scene, part, np.array(kept).reshape(-1, 4, 4))
+    points = placed(scene.T_scene_camera, scene.points[left])
+    return replace(found, unexplained=float(left.sum() / scene.foreground.sum()), unexplained_points=points)
 
 
 def _points_of(empty: Scan, scene: Scene) -> Float[np.ndarray, "e 3"]:

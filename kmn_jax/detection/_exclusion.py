@@ -41,7 +41,12 @@ def apart(found: Sequence[Detections], parts: Sequence[Part]) -> tuple[Detection
         left_out = len(one.poses) - len(poses)
         if left_out:
             text = f"{left_out} of {len(one.poses)} poses were left out, as more probable ones of other parts are there"
-            one = replace(one, poses=poses, warnings=(*one.warnings, text), reason=one.reason if poses else text)
+            one = replace(
+                one,
+                poses=poses,
+                warnings=(*one.warnings, text) if poses else one.warnings,
+                reason=one.reason if poses else text,
+            )
         results.append(one)
     return tuple(results)
 

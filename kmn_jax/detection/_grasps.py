@@ -78,7 +78,8 @@ def with_grasps(
     """
     own = grasps.in_unit(scene.unit)
     check_on_part(own, part)
-    turns = symmetry_transforms(part.symmetries).astype(np.float64)
+    turns = symmetry_transforms(part.centred().symmetries).astype(np.float64)
+    turns[:, :3, 3] += part.origin - turns[:, :3, :3] @ part.origin  # in the part's own frame, which may lie far away
     turns = turns[np.linspace(0, len(turns) - 1, min(len(turns), _MOST_TURNS)).astype(int)]
     boxes = [own.gripper.boxes(one.width) for one in own.grasps]
     centers, sizes = (

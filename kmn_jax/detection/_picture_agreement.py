@@ -94,7 +94,7 @@ class _Measured(NamedTuple):
 def picture_agreement(T_camera_object: Pose, surfels: Surfels, image: DepthImage, diameter: Scalar) -> PictureAgreement:
     """Compare an object at a pose with a depth image in the same unit, zero where nothing was measured.
 
-    All is zero of a pose that shows nothing to the camera.
+    All is zero of a pose that shows nothing to the camera, but `log_area`, which is then the least.
     """
     seen = _predicted(T_camera_object, surfels, image)
     found = _measured(seen, image, diameter)

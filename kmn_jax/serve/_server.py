@@ -87,6 +87,7 @@ def uvicorn_config(app: Any, config: ServeConfig) -> Any:
         http=functools.partial(BoundedConnection, config),  # type: ignore[arg-type]
         ws="none",
         loop="asyncio",
+        log_config=None,  # which would end the handlers that the process has
         log_level="error",  # what clients do wrong is no news
         access_log=False,
         proxy_headers=False,

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from kmn_jax.detection import Detections
+from kmn_jax.detection import DetectConfig, Detections
 from kmn_jax.geometry import Camera
 from kmn_jax.objects import Part
 from kmn_jax.viz._raster import Canvas
 from kmn_jax.viz._shading import as_bytes, brightness, distinct_colors, surface_hexagons
 from kmn_jax.viz._truth import nearest_keypoint
 
-LIKELY = 0.5  # poses below that probability are drawn pale
+LIKELY = DetectConfig().accepted  # poses below that probability are drawn pale
 NOT_THE_PART = (0.30, 0.32, 0.36)  # the colour of points of crops that are on no copy
 UNEXPLAINED = (0.62, 0.40, 0.22)  # that of foreground on no pose
 _LISTED = 16  # poses

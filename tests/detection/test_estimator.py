@@ -74,6 +74,7 @@ def test_a_bin_is_found_and_the_same_inputs_give_the_same_bits(
     estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray], whole: Detections
 ) -> None:
     (scan, truth), found = seen, whole
+    assert len(found.poses) > 1
     likely = [pose for pose in found.poses if pose.probability >= 0.5]
     right = [errors(pose.T_scene_object, truth, motor).min() < 0.1 for pose in likely]
     print(f"copies {len(truth)}, found {len(likely)}, right {sum(right)}, {found.timing}")

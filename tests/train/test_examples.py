@@ -50,7 +50,8 @@ def test_a_network_of_one_object_has_the_same_keypoints_whatever_is_drawn(stacke
         found: Group = make(stacked.arrays, jnp.int32(1), drops, keys(seed, 4), network, CONFIG)
         np.testing.assert_array_equal(found.keypoint_indices, np.arange(6))
         own = group(stacked, seed, CONFIG)
-        np.testing.assert_array_equal(found.crops, own.crops)  # what is drawn of the scenes is the same
+        # What is drawn of the scenes is the same; programs that differ may round it differently.
+        np.testing.assert_allclose(found.crops, own.crops, rtol=0, atol=1e-6)
         assert (np.asarray(found.keypoint) < 6).all()
 
 
@@ -136,10 +137,10 @@ def test_keypoints_are_random_in_the_configured_share(stacked: StackedPack) -> N
 def test_crops_of_one_scene_are_those_of_its_keys(stacked: StackedPack) -> None:
     shared = group(stacked, 3, replace(CONFIG, crops_per_scene=2))
     alone = group(stacked, 3, CONFIG)
-    np.testing.assert_array_equal(shared.crops[0], alone.crops[0])
-    np.testing.assert_array_equal(shared.crops[2], alone.crops[2])
-    assert not np.array_equal(shared.crops[1], alone.crops[1])  # of the scene before
-    assert not np.array_equal(shared.crops[0], shared.crops[1])
+    for row in (0, 2):  # programs that differ may round differently
+        np.testing.assert_allclose(shared.crops[row], alone.crops[row], rtol=0, atol=1e-6)
+    assert not np.allclose(shared.crops[1], alone.crops[1], atol=1e-3)  # of the scene before
+    assert not np.allclose(shared.crops[0], shared.crops[1], atol=1e-3)
 
 
 def test_labels_of_rendered_crops_are_the_nearest_keypoints(stacked: StackedPack) -> None:
