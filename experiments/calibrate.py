@@ -1,8 +1,8 @@
 """Fit the probabilities of detections: `python -m experiments.calibrate [MODEL.safetensors]`.
 
 Poses are searched in the validation bins (`python -m experiments.build_data validation-bins`), whose objects the
-network was not trained with, and with `--worlds` in the whole scans of world bins; in every second one also a part that is
-not there. A small model of the evidence is fitted to whether they are right. Each object's probabilities are also
+network was not trained with, and with `--worlds` in the whole scans of world bins; in every second one also a part that
+is not there. A small model of the evidence is fitted to whether they are right. Each object's probabilities are also
 predicted by a model that was fitted without it, which gives the reliability that is printed. The model of poses as
 they are found is fitted first: it chooses which of them are refined, here as in detection.
 """
