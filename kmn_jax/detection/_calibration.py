@@ -87,7 +87,7 @@ def fit_calibration(
 ) -> Calibration:
     """Fit to poses of which it is known whether they are right; `weights` count some as several.
 
-    The same arguments give the same model. Raises InputError if all are right or all are wrong.
+    The same arguments give the same model on one machine. Raises InputError if all are right or all are wrong.
     """
     from scipy.optimize import minimize
 

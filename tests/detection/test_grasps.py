@@ -72,6 +72,23 @@ def test_of_poses_that_look_the_same_a_free_one_is_taken() -> None:
         np.testing.assert_allclose(copy.grasps[0].T_scene_grasp[:3, 2], [0, 0, 1], atol=1e-6)
 
 
+def test_grasps_of_a_symmetric_part_far_from_its_frame_s_origin_are_those_of_a_near_one() -> None:
+    offset = np.array([1e9, 0.0, -1e9])
+    both = Symmetries(np.stack([np.eye(3), BEHIND[:3, :3]]), np.zeros((0, 3)), np.zeros(3), 0.02)
+    moved = {name: getattr(PART, name).astype(np.float64) + offset for name in ("points", "minimum", "maximum")}
+    far = replace(PART, **moved, symmetries=replace(both, center=offset))
+    away, back = np.eye(4), np.eye(4)
+    away[:3, 3], back[:3, 3] = -offset, offset
+    poses = tuple(replace(one, T_scene_object=one.T_scene_object.astype(float) @ away) for one in FOUND.poses)
+    near_found = with_grasps(FOUND, grasps((BEHIND, SIZES[0])), replace(PART, symmetries=both), VIEW, None)
+    far_found = with_grasps(replace(FOUND, poses=poses), grasps((back @ BEHIND, SIZES[0])), far, VIEW, None)
+    assert names(far_found) == names(near_found) == [["way 1"]] * 2
+    for one, other in zip(far_found.poses, near_found.poses, strict=True):
+        assert one.grasps is not None
+        assert other.grasps is not None
+        np.testing.assert_allclose(one.grasps[0].T_scene_grasp, other.grasps[0].T_scene_grasp, atol=1e-5)
+
+
 def test_a_gripper_inside_of_its_own_part_is_refused() -> None:
     with pytest.raises(InputError, match=r"at the grasp 'way 2', \d+% of the gripper would be inside of box"):
         with_grasps(FOUND, grasps((np.eye(4), SIZES[0]), (ACROSS, 0.5 * SIZES[1])), PART, VIEW, None)
