@@ -32,6 +32,7 @@ _WARMING_UP = "the server is still compiling: ask /health when it is ready"
 _PROBLEMS: dict[int | str, dict[str, Any]] = {
     400: {"model": Problem, "description": "Bad input"},
     413: {"model": Problem, "description": "Too large"},
+    415: {"model": Problem, "description": "No multipart/form-data, or with a charset"},
     422: {"model": Problem, "description": "Not the fields that are asked for"},
     503: {"model": Problem, "description": "Too much to do, or not ready: try again after the seconds of Retry-After"},
     504: {"model": Problem, "description": "Took too long"},

@@ -8,7 +8,7 @@ import http.client
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from kmn_jax.errors import InputError
 from kmn_jax.serve import ServeConfig
 from kmn_jax.serve._gate import Gate
 from kmn_jax.web import is_allowed_host, is_same_origin
-from tests.serve.serve_sample import Running, form, running, some_scan
+from tests.serve.serve_sample import Running, eventually, form, running, some_scan
 
 SCAN = ("scan.ply", some_scan())
 QUICK = ServeConfig(
@@ -29,9 +29,9 @@ QUICK = ServeConfig(
     most_queued=2,
     most_connections=12,
     time_limit=20.0,
-    head_limit=0.6,
-    body_limit=0.6,
-    write_limit=0.6,
+    head_limit=1.0,
+    body_limit=2.0,
+    write_limit=1.0,
 )
 
 
@@ -41,17 +41,11 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         yield one
 
 
-def eventually(condition: Callable[[], object], seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it has not come true"
-        time.sleep(0.01)
-
-
 def opened(server: Running, sent: bytes = b"") -> socket.socket:
     """Return a connection on which something has been sent."""
     connection = socket.create_connection(("127.0.0.1", server.port), timeout=20)
-    connection.sendall(sent)
+    with contextlib.suppress(ConnectionError):  # it may be refused before it has all been sent
+        connection.sendall(sent)
     return connection
 
 
@@ -158,6 +152,18 @@ def test_bodies_that_are_too_large_are_refused_before_they_are_read(server: Runn
     assert search(server)[0] == 200
 
 
+def test_forms_of_other_kinds_and_charsets_are_refused_before_they_are_read(server: Running) -> None:
+    body, kind = form(object=b"solid", scene=SCAN, part="a-" * 50_000)
+    for one in (f"{kind}; charset=punycode", f"{kind}; CHARSET*=punycode", "application/x-www-form-urlencoded", ""):
+        status, said, _ = server.ask("POST", "/detect", body, {"Content-Type": one})
+        assert (status, said["error"]) == (415, "send fields and files as multipart/form-data, without a charset"), one
+    assert server.ask("PUT", "/parts/a", b"solid", {"Content-Type": "model/stl"})[0] == 415
+    for first, second in ((f"{kind}; charset=punycode", kind), (kind, f"{kind}; charset=punycode")):
+        head = f"POST /detect HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Length: 0\r\nContent-Type: {first}"
+        twice = opened(server, f"{head}\r\nContent-Type: {second}\r\n\r\n".encode())
+        assert rest(twice).startswith(b"HTTP/1.1 415 ")
+
+
 def test_bodies_that_wait_are_bounded_together() -> None:
     held, most = 16, 10
 
@@ -172,7 +178,8 @@ def test_bodies_that_wait_are_bounded_together() -> None:
             return {"type": "http.request", "body": bytes(most), "more_body": False}
 
         async def ask() -> int | None:
-            scope = {"type": "http", "headers": [(b"host", b"localhost")]}
+            headers = [(b"host", b"localhost"), (b"content-type", b"multipart/form-data; boundary=x")]
+            scope = {"type": "http", "method": "POST", "headers": headers}
             try:
                 await gate(scope, receive, receive)  # type: ignore[arg-type]  # nothing is sent
             except HTTPException as error:
