@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
+import gc
 import http.client
 import socket
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -19,6 +22,7 @@ from starlette.exceptions import HTTPException
 from kmn_jax.errors import InputError
 from kmn_jax.serve import ServeConfig
 from kmn_jax.serve._gate import Gate
+from kmn_jax.serve._worker import Worker
 from kmn_jax.web import is_allowed_host, is_same_origin
 from tests.serve.serve_sample import Running, eventually, form, running, some_scan
 
@@ -159,9 +163,9 @@ def test_forms_of_other_kinds_and_charsets_are_refused_before_they_are_read(serv
         assert (status, said["error"]) == (415, "send fields and files as multipart/form-data, without a charset"), one
     assert server.ask("PUT", "/parts/a", b"solid", {"Content-Type": "model/stl"})[0] == 415
     for first, second in ((f"{kind}; charset=punycode", kind), (kind, f"{kind}; charset=punycode")):
-        head = f"POST /detect HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Length: 0\r\nContent-Type: {first}"
-        twice = opened(server, f"{head}\r\nContent-Type: {second}\r\n\r\n".encode())
-        assert rest(twice).startswith(b"HTTP/1.1 415 ")
+        head = "POST /detect HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Length: 0\r\n"
+        twice = f"{head}Content-Type: {first}\r\nContent-Type: {second}\r\n\r\n"
+        assert rest(opened(server, twice.encode())).startswith(b"HTTP/1.1 415 ")
 
 
 def test_bodies_that_wait_are_bounded_together() -> None:
@@ -220,6 +224,19 @@ def test_slow_clients_are_given_up_and_others_answered(server: Running) -> None:
     eventually(lambda: bool(server.server.server_state.connections))
     eventually(lambda: not server.server.server_state.connections)
     assert 0 < len(rest(lazy)) < 2000 * 10_000
+
+
+def test_a_client_that_does_not_take_its_last_answer_is_given_up(tmp_path: Path) -> None:
+    with running(tmp_path, QUICK) as server, socket.socket() as lazy:
+        size = int(server.ask("GET", "/openapi.json")[2]["Content-Length"])
+        server.server.servers[0].sockets[0].setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        lazy.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
+        lazy.connect(("127.0.0.1", server.port))
+        lazy.sendall(b"GET /openapi.json HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+        state = server.server.server_state
+        eventually(lambda: state.total_requests == 2)
+        eventually(lambda: not state.connections)
+        assert len(rest(lazy)) < size
 
 
 def test_many_connections_do_not_keep_a_client_out(server: Running) -> None:
@@ -286,6 +303,25 @@ def test_a_client_that_has_gone_is_not_searched_for(server: Running) -> None:
         server.known.may_answer.set()
         assert first.result()[0] == 200
     assert server.known.asked == []
+
+
+def test_a_job_that_is_cancelled_is_held_no_longer() -> None:
+    class Form:
+        pass
+
+    may_end, worker, sent = threading.Event(), Worker(2, 20.0), Form()
+    still_there = weakref.ref(sent)
+    first = worker.start(may_end.wait)
+    second = worker.start(functools.partial(id, sent))
+    del sent
+    assert still_there() is not None
+    assert second.cancel()
+    gc.collect()
+    assert still_there() is None
+    assert not first.done()
+    assert worker.queued == 1
+    may_end.set()
+    worker.close()
 
 
 def test_a_request_that_takes_too_long_is_given_up(tmp_path: Path) -> None:
