@@ -314,14 +314,16 @@ def test_a_job_that_is_cancelled_is_held_no_longer() -> None:
     first = worker.start(may_end.wait)
     second = worker.start(functools.partial(id, sent))
     del sent
-    assert still_there() is not None
-    assert second.cancel()
-    gc.collect()
-    assert still_there() is None
-    assert not first.done()
-    assert worker.queued == 1
-    may_end.set()
-    worker.close()
+    try:
+        assert still_there() is not None
+        assert second.cancel()
+        gc.collect()
+        assert still_there() is None
+        assert not first.done()
+        assert worker.queued == 1
+    finally:
+        may_end.set()
+        worker.close()
 
 
 def test_a_request_that_takes_too_long_is_given_up(tmp_path: Path) -> None:
