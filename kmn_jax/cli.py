@@ -16,7 +16,7 @@ import tyro
 
 from kmn_jax import __version__
 from kmn_jax.arguments import joined, parsed
-from kmn_jax.errors import InputError, number_list
+from kmn_jax.errors import InputError, number_list, require
 from kmn_jax.extras import missing_packages
 from kmn_jax.files import check_output, write_whole
 
@@ -206,6 +206,7 @@ def serve(
     from kmn_jax.serve import ServeConfig
     from kmn_jax.serve import serve as run
 
+    require(bool(np.isfinite(max_megabytes)), f"--max-megabytes is {max_megabytes}, but must be finite")
     limits = ServeConfig(host, port, allow_host, int(1e6 * max_megabytes), max_queue, time_limit)
     run(limits, weights, parts, example, camera, lambda url: print(f"serving on {url}; stop with Ctrl+C", flush=True))
 

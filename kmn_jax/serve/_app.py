@@ -32,6 +32,7 @@ _WARMING_UP = "the server is still compiling: ask /health when it is ready"
 _PROBLEMS: dict[int | str, dict[str, Any]] = {
     400: {"model": Problem, "description": "Bad input"},
     413: {"model": Problem, "description": "Too large"},
+    415: {"model": Problem, "description": "No multipart/form-data, or with a charset"},
     422: {"model": Problem, "description": "Not the fields that are asked for"},
     503: {"model": Problem, "description": "Too much to do, or not ready: try again after the seconds of Retry-After"},
     504: {"model": Problem, "description": "Took too long"},
@@ -137,8 +138,13 @@ async def prepare_part(
     """Prepare a part from a file, and keep it under a name; one that had the name before is replaced."""
     service, upload = _service(request), _upload(file)
     check_name(name)
-    part = await service.run(request, lambda: service.searches.prepare(upload, units))
-    response.status_code = 201 if service.store.add(name, part) else 200
+
+    def prepare() -> tuple[Part, bool]:  # kept even if the answer comes too late
+        part = service.searches.prepare(upload, units)
+        return part, service.store.add(name, part)
+
+    part, is_new = await service.run(request, prepare)
+    response.status_code = 201 if is_new else 200
     return _info(name, part)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import io
-import json
 import secrets
 import urllib.error
 import urllib.parse
@@ -20,6 +19,7 @@ from kmn_jax.bop import bop_object, bop_scan, bop_scene_id, is_bop_image
 from kmn_jax.detection import CropPrediction, Detection, Detections, Timing
 from kmn_jax.errors import InputError
 from kmn_jax.io import read_file, resolve_unit
+from kmn_jax.limits import parse_json
 from kmn_jax.units import METRES
 
 _SECONDS = 600.0  # that an answer is waited for
@@ -61,14 +61,28 @@ def detect_on_server(
     body, kind = _form({**given, "units": units, "picture": picture}, files)
     content, headers = _request(server, "/detect", body, {"Content-Type": kind})
     try:
-        result = dict(json.loads(content)) | {"object": str(part), "scene": str(scene)}
-        said = json.loads(_request(server, headers["Part"])[0])
-        drawn = _request(server, headers["Picture"])[0] if picture else b""
+        result = dict(_parsed(server, content)) | {"object": str(part), "scene": str(scene)}
+        said = _parsed(server, _request(server, _place(headers["Part"]))[0])
+        drawn = _request(server, _place(headers["Picture"]))[0] if picture else b""
         return ServerAnswer(result, _detections(result, said["label"]), _bop_ids(scene, camera, said), drawn)
     except InputError:
         raise
-    except (KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, TypeError, ValueError):
         raise InputError(f"the server at {server} does not answer as kmn serve does") from None
+
+
+def _parsed(server: str, content: bytes) -> Any:
+    try:
+        return parse_json(content)
+    except InputError:
+        raise InputError(f"the server at {server} does not answer as kmn serve does") from None
+
+
+def _place(path: str) -> str:
+    """Return a path of the same server, or raise ValueError: what follows an address could make it another's."""
+    if not path.startswith("/"):
+        raise ValueError("no path")
+    return path
 
 
 def _scan_file(path: Path, camera: Path | None) -> tuple[str, bytes]:
@@ -124,8 +138,8 @@ def _request(
             return answer.read(), answer.headers
     except urllib.error.HTTPError as error:
         try:
-            said = json.loads(error.read())["error"]
-        except (ValueError, KeyError, TypeError, OSError):
+            said = parse_json(error.read())["error"]
+        except (ValueError, KeyError, TypeError, OSError, http.client.HTTPException):
             said = f"it answered {error.code} {error.reason}, as kmn serve does not"
         raise InputError(f"the server at {server} says: {said}") from None
     except (OSError, ValueError, http.client.HTTPException) as error:

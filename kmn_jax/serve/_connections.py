@@ -87,7 +87,9 @@ class BoundedConnection(H11Protocol):
     def _watch(self) -> None:
         """Look what the client is waited for; a client that sends a little of it is given no more time."""
         awaited = None
-        if self._is_writing_paused:
+        if self not in self.connections:
+            pass
+        elif self._is_writing_paused or self.transport.is_closing():
             awaited = "write"
         elif self.conn.their_state is h11.SEND_BODY:
             awaited = "body"
@@ -100,6 +102,6 @@ class BoundedConnection(H11Protocol):
         if self._timer is not None:
             self._timer.cancel()
         self._awaited, self._timer, self.waits_since = awaited, None, None
-        if awaited is not None and not self.transport.is_closing():
+        if awaited is not None:
             self.waits_since = self.loop.time()
             self._timer = self.loop.call_later(self._limits[awaited], self.drop)

@@ -34,8 +34,11 @@ class Gate:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
-        refusal = self._refusal(headers)
+        headers: dict[str, str] = {}
+        for name, value in scope["headers"]:  # what is there twice is checked as a whole
+            earlier = headers.get(name.decode("latin-1"))
+            headers[name.decode("latin-1")] = ", ".join(filter(None, (earlier, value.decode("latin-1"))))
+        refusal = self._refusal(scope["method"], headers)
         if refusal is not None:
             await _answer(send, *refusal)
             return
@@ -45,7 +48,7 @@ class Gate:
         finally:
             self._held -= body.size
 
-    def _refusal(self, headers: dict[str, str]) -> tuple[int, str] | None:
+    def _refusal(self, method: str, headers: dict[str, str]) -> tuple[int, str] | None:
         host = headers.get("host", "")
         if not is_allowed_host(host, self._config.allowed_hosts):
             return (
@@ -54,6 +57,10 @@ class Gate:
             )
         if not is_same_origin(headers.get("origin"), host):
             return 403, "this server does not answer pages of other sites"
+        # Forms of other kinds are not asked for, and decoding by a client's charset can take minutes.
+        kind = headers.get("content-type", "").lower()
+        if method in ("POST", "PUT") and (not kind.startswith("multipart/form-data") or "charset" in kind):
+            return 415, "send fields and files as multipart/form-data, without a charset"
         length = headers.get("content-length", "0")
         if not length.isdecimal() or int(length) > self._config.most_bytes:
             return 413, self._too_large

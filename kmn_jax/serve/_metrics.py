@@ -11,6 +11,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Proc
 from kmn_jax.serve._gate import Asgi, AsgiScope, Receive, Send
 
 _SECONDS = (0.01, 0.03, 0.1, 0.3, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 30.0, 100.0)
+_METHODS = ("GET", "PUT", "POST", "DELETE")
 _NO_ANSWER = "499"  # the client was gone before
 
 
@@ -57,9 +58,9 @@ class Metrics:
             try:
                 await app(scope, receive, sent)
             finally:
-                # The pattern, not the path: what clients make up must not make counters.
+                # What clients make up, as paths and methods, must not make counters.
                 route = getattr(scope.get("route"), "path", "other")
-                method = scope["method"] if route != "other" else "other"
+                method = scope["method"] if route != "other" and scope["method"] in _METHODS else "other"
                 self._requests.labels(method, route, status).inc()
                 self._seconds.labels(method, route).observe(time.perf_counter() - start)
 

@@ -31,7 +31,7 @@ from kmn_jax.units import check_unit
 
 _MOST_PICTURES = 16  # the last ones, which can be fetched
 _PIECE = 1 << 20  # bytes
-_LONGEST = 60  # letters of a file's name
+_LONGEST = 30  # letters of a file's name, and of its suffix: of up to 4 bytes each, where 255 bytes are allowed
 
 
 @dataclass(frozen=True)

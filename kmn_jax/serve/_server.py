@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import signal
 import tempfile
 import threading
@@ -49,7 +50,7 @@ def serve(
     listening = listen(config.host, config.port)
     with contextlib.closing(listening), _private_folder() as folder:
         estimator = PoseEstimator.from_pretrained(weights)
-        named = {} if parts is None else _prepared(estimator, parts)
+        named = {} if parts is None else _prepared(estimator, parts, config.most_parts)
         store = PartStore(config.most_parts, named)
         scan: Scan | None = None
         if example is not None:
@@ -92,6 +93,7 @@ def uvicorn_config(app: Any, config: ServeConfig) -> Any:
         access_log=False,
         proxy_headers=False,
         server_header=False,
+        timeout_keep_alive=math.ceil(config.head_limit),
         timeout_graceful_shutdown=int(config.body_limit + config.time_limit + _AFTER_LIMITS),
     )
 
@@ -131,13 +133,15 @@ def search_all(estimator: PoseEstimator, part: Part | None, scan: Scan | None) -
         save_picture(Path(folder, "picture.png"), scene, used, found)
 
 
-def _prepared(estimator: PoseEstimator, folder: Path) -> dict[str, Part]:
+def _prepared(estimator: PoseEstimator, folder: Path, most: int) -> dict[str, Part]:
     """Return the parts of a folder's files by their names."""
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: name one that holds CAD files or cards")
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in _PART_SUFFIXES)
     if not files:
         raise InputError(f"{folder} holds no part: put CAD files or cards into it ({', '.join(_PART_SUFFIXES)})")
+    if len(files) > most:
+        raise InputError(f"{folder} holds {len(files)} parts, but at most {most} are kept: leave some out")
     named: dict[str, Part] = {}
     for path in files:
         if path.stem in named:

@@ -50,18 +50,24 @@ class Worker:
     def start(self, job: Callable[[], Answer]) -> Future[Answer]:
         """Put a job into the queue, however long that is."""
         self._count(1)
-        future = self._thread.submit(self._timed, job)
-        future.add_done_callback(lambda _: self._count(-1))
+        held = [job]  # a job that is cancelled stays in the thread's queue, but not with all that it holds
+        future = self._thread.submit(self._timed, held)
+
+        def done(_: Future[Answer]) -> None:
+            held.clear()
+            self._count(-1)
+
+        future.add_done_callback(done)
         return future
 
     def close(self) -> None:
         """Forget what has not begun."""
         self._thread.shutdown(wait=False, cancel_futures=True)
 
-    def _timed(self, job: Callable[[], Answer]) -> Answer:
+    def _timed(self, held: list[Callable[[], Answer]]) -> Answer:
         start = time.perf_counter()
         try:
-            return job()
+            return held.pop()()
         finally:
             self._mean_s += _FORGETTING * (time.perf_counter() - start - self._mean_s)
 

@@ -40,14 +40,15 @@ class Door:
         """Tell why a request is refused, None if it is not."""
         try:
             host, origin, cookies = headers.get("Host", ""), headers.get("Origin"), headers.get("Cookie", "")
-        except LookupError:  # one of them is there twice
+            tokens = parse_qs(urlsplit(path).query).get("token", [])
+        except (LookupError, ValueError):  # one of them is there twice, or the path is none
             return "This request cannot be understood."
         if not is_allowed_host(host, self._hosts):
             return "This page is not served under that name."
         if not is_same_origin(origin, host):
             return "This page is not for pages of other sites."
-        given = [*parse_qs(urlsplit(path).query).get("token", []), self._cookie_in(cookies)]
-        if not any(secrets.compare_digest(one.encode(), self.token.encode()) for one in given):
+        given = [one.encode(errors="surrogateescape") for one in (*tokens, self._cookie_in(cookies))]
+        if not any(secrets.compare_digest(one, self.token.encode()) for one in given):
             return "Open the whole address that was printed, with its token."
         return None
 
@@ -72,8 +73,11 @@ def start_server(host: str, port: int) -> tuple[Any, str]:
     except ImportError:
         raise InputError("the page needs a package that is not installed: pip install 'kmn_jax[view]'") from None
     door = Door(host)
-    with contextlib.redirect_stdout(io.StringIO()), _behind(door):  # our caller says where the page is
+    with contextlib.redirect_stdout(io.StringIO()), _behind(door) as used:  # our caller says where the page is
         server = viser.ViserServer(host=host, port=port, verbose=False)
+    if not used:
+        stop_server(server)
+        raise InputError("this version of viser cannot be guarded by a token: install another one")
     # The page could ask for a public address by a server elsewhere; scans stay here.
     server.request_share_url = lambda verbose=True: None
     if port not in (0, server.get_port()):
@@ -89,9 +93,14 @@ def stop_server(server: Any) -> None:
 
 
 @contextlib.contextmanager
-def _behind(door: Door) -> Iterator[None]:
-    """Let the server that viser starts meanwhile be one behind the door: viser has no setting for it."""
+def _behind(door: Door) -> Iterator[list[Any]]:
+    """Let the server that viser starts meanwhile be one behind the door: viser has no setting for it.
+
+    Yields the handlers that stand behind the door, none if viser has found another way.
+    """
     import websockets.asyncio.server as servers
+
+    used: list[Any] = []
 
     def serve(handler: Callable[[Any], Awaitable[None]], *place: Any, **given: Any) -> Any:
         answer = given["process_request"]
@@ -113,12 +122,13 @@ def _behind(door: Door) -> Iterator[None]:
                 await connection.close(_NOT_READABLE, "a message could not be read")
 
         limits = {"process_request": checked, "max_size": _MOST_BYTES, "logger": _LOG}
+        used.append(handler)
         return plain(handled, *place, **given | limits)
 
     with _STARTING:
         plain = servers.serve
         servers.serve = serve  # type: ignore[assignment, misc]
         try:
-            yield
+            yield used
         finally:
             servers.serve = plain  # type: ignore[misc]

@@ -6,7 +6,8 @@ import http.client
 import json
 import secrets
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -108,6 +109,13 @@ def form(**fields: Any) -> tuple[bytes, str]:
     return b"".join([*pieces, f"--{boundary}--\r\n".encode()]), f"multipart/form-data; boundary={boundary}"
 
 
+def eventually(condition: Callable[[], object], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it has not come true"
+        time.sleep(0.01)
+
+
 @contextmanager
 def running(
     folder: Path, config: ServeConfig | None = None, estimator: Any = None, warm_up: Any = None
@@ -131,6 +139,9 @@ def running(
     thread.start()
     try:
         assert ready.wait(30)
+        service = app.state.service
+        if warm_up is None:
+            eventually(lambda: service.is_ready and service.worker.queued == 0)
         port = server.servers[0].sockets[0].getsockname()[1]
         yield Running(port, known, app, server, folder)
     finally:

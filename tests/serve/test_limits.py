@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
+import gc
 import http.client
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+import weakref
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -19,8 +22,9 @@ from starlette.exceptions import HTTPException
 from kmn_jax.errors import InputError
 from kmn_jax.serve import ServeConfig
 from kmn_jax.serve._gate import Gate
+from kmn_jax.serve._worker import Worker
 from kmn_jax.web import is_allowed_host, is_same_origin
-from tests.serve.serve_sample import Running, form, running, some_scan
+from tests.serve.serve_sample import Running, eventually, form, running, some_scan
 
 SCAN = ("scan.ply", some_scan())
 QUICK = ServeConfig(
@@ -29,9 +33,9 @@ QUICK = ServeConfig(
     most_queued=2,
     most_connections=12,
     time_limit=20.0,
-    head_limit=0.6,
-    body_limit=0.6,
-    write_limit=0.6,
+    head_limit=1.0,
+    body_limit=2.0,
+    write_limit=1.0,
 )
 
 
@@ -41,17 +45,11 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         yield one
 
 
-def eventually(condition: Callable[[], object], seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it has not come true"
-        time.sleep(0.01)
-
-
 def opened(server: Running, sent: bytes = b"") -> socket.socket:
     """Return a connection on which something has been sent."""
     connection = socket.create_connection(("127.0.0.1", server.port), timeout=20)
-    connection.sendall(sent)
+    with contextlib.suppress(ConnectionError):  # it may be refused before it has all been sent
+        connection.sendall(sent)
     return connection
 
 
@@ -158,6 +156,18 @@ def test_bodies_that_are_too_large_are_refused_before_they_are_read(server: Runn
     assert search(server)[0] == 200
 
 
+def test_forms_of_other_kinds_and_charsets_are_refused_before_they_are_read(server: Running) -> None:
+    body, kind = form(object=b"solid", scene=SCAN, part="a-" * 50_000)
+    for one in (f"{kind}; charset=punycode", f"{kind}; CHARSET*=punycode", "application/x-www-form-urlencoded", ""):
+        status, said, _ = server.ask("POST", "/detect", body, {"Content-Type": one})
+        assert (status, said["error"]) == (415, "send fields and files as multipart/form-data, without a charset"), one
+    assert server.ask("PUT", "/parts/a", b"solid", {"Content-Type": "model/stl"})[0] == 415
+    for first, second in ((f"{kind}; charset=punycode", kind), (kind, f"{kind}; charset=punycode")):
+        head = "POST /detect HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Length: 0\r\n"
+        twice = f"{head}Content-Type: {first}\r\nContent-Type: {second}\r\n\r\n"
+        assert rest(opened(server, twice.encode())).startswith(b"HTTP/1.1 415 ")
+
+
 def test_bodies_that_wait_are_bounded_together() -> None:
     held, most = 16, 10
 
@@ -172,7 +182,8 @@ def test_bodies_that_wait_are_bounded_together() -> None:
             return {"type": "http.request", "body": bytes(most), "more_body": False}
 
         async def ask() -> int | None:
-            scope = {"type": "http", "headers": [(b"host", b"localhost")]}
+            headers = [(b"host", b"localhost"), (b"content-type", b"multipart/form-data; boundary=x")]
+            scope = {"type": "http", "method": "POST", "headers": headers}
             try:
                 await gate(scope, receive, receive)  # type: ignore[arg-type]  # nothing is sent
             except HTTPException as error:
@@ -213,6 +224,19 @@ def test_slow_clients_are_given_up_and_others_answered(server: Running) -> None:
     eventually(lambda: bool(server.server.server_state.connections))
     eventually(lambda: not server.server.server_state.connections)
     assert 0 < len(rest(lazy)) < 2000 * 10_000
+
+
+def test_a_client_that_does_not_take_its_last_answer_is_given_up(tmp_path: Path) -> None:
+    with running(tmp_path, QUICK) as server, socket.socket() as lazy:
+        size = int(server.ask("GET", "/openapi.json")[2]["Content-Length"])
+        server.server.servers[0].sockets[0].setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        lazy.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
+        lazy.connect(("127.0.0.1", server.port))
+        lazy.sendall(b"GET /openapi.json HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+        state = server.server.server_state
+        eventually(lambda: state.total_requests == 2)
+        eventually(lambda: not state.connections)
+        assert len(rest(lazy)) < size
 
 
 def test_many_connections_do_not_keep_a_client_out(server: Running) -> None:
@@ -279,6 +303,27 @@ def test_a_client_that_has_gone_is_not_searched_for(server: Running) -> None:
         server.known.may_answer.set()
         assert first.result()[0] == 200
     assert server.known.asked == []
+
+
+def test_a_job_that_is_cancelled_is_held_no_longer() -> None:
+    class Form:
+        pass
+
+    may_end, worker, sent = threading.Event(), Worker(2, 20.0), Form()
+    still_there = weakref.ref(sent)
+    first = worker.start(may_end.wait)
+    second = worker.start(functools.partial(id, sent))
+    del sent
+    try:
+        assert still_there() is not None
+        assert second.cancel()
+        gc.collect()
+        assert still_there() is None
+        assert not first.done()
+        assert worker.queued == 1
+    finally:
+        may_end.set()
+        worker.close()
 
 
 def test_a_request_that_takes_too_long_is_given_up(tmp_path: Path) -> None:

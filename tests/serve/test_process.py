@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -19,18 +20,22 @@ import numpy as np
 import pytest
 
 from kmn_jax.cli import main
-from tests.serve.serve_sample import form, running, some_scan
+from kmn_jax.errors import InputError
+from kmn_jax.serve import ServeConfig
+from kmn_jax.serve._server import _prepared, uvicorn_config
+from tests.serve.serve_sample import KnownAnswer, form, running, some_scan
 
-# The command itself, with an estimator that needs no compiling and takes a second for a search.
+# The command itself, with an estimator that needs no compiling and searches once it may.
 PROGRAM = """
-import sys, time
+import os, sys, time
 from kmn_jax.cli import main
 from kmn_jax.detection import PoseEstimator
 from tests.serve import serve_sample
 
 class Slow(serve_sample.KnownAnswer):
     def detect(self, part, scene, **given):
-        time.sleep(1.0 if given.get("top") else 0.0)
+        while given.get("top") and not os.path.exists(os.environ["MAY_ANSWER"]):
+            time.sleep(0.05)
         return serve_sample.FOUND
 
 PoseEstimator.from_pretrained = lambda weights: Slow()
@@ -44,7 +49,8 @@ def test_the_command_answers_ends_when_told_and_leaves_nothing_behind(tmp_path: 
     parts.mkdir()
     (parts / "box.stl").write_bytes(b"solid")
     command = [sys.executable, "-c", PROGRAM, "serve", "--port", "0", "--parts", str(parts)]
-    environment = os.environ | {"TMPDIR": str(folder)}
+    may_answer = tmp_path / "may-answer"
+    environment = os.environ | {"TMPDIR": str(folder), "MAY_ANSWER": str(may_answer)}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     try:
         assert process.stdout is not None
@@ -63,6 +69,7 @@ def test_the_command_answers_ends_when_told_and_leaves_nothing_behind(tmp_path: 
                 answers.append(b"".join(pieces))
 
         while not answers or not answers[-1].startswith(b"HTTP/1.1 200"):  # warm
+            time.sleep(0.05)
             ask(b"GET /health HTTP/1.1\r\n")
         ask(b"GET /parts HTTP/1.1\r\n")
         assert b'"name":"box"' in answers[-1]
@@ -74,11 +81,13 @@ def test_the_command_answers_ends_when_told_and_leaves_nothing_behind(tmp_path: 
         for thread in threads:
             thread.start()
         while b'"queued":2' not in (answers[-1] if answers else b""):
+            time.sleep(0.05)
             ask(b"GET /health HTTP/1.1\r\n")
         (private,) = folder.iterdir()
         assert private.stat().st_mode & 0o777 == 0o700
         del answers[:]
         process.send_signal(signal.SIGTERM)
+        may_answer.touch()
         out, error = process.communicate(timeout=60)
         for thread in threads:
             thread.join(60)
@@ -96,6 +105,8 @@ def test_the_command_answers_ends_when_told_and_leaves_nothing_behind(tmp_path: 
         (["--port", "70000"], "port 70000 is not one"),
         (["--host", "no.such.host.invalid"], "host 'no.such.host.invalid' is not known"),
         (["--max-queue", "0"], "most_queued is 0"),
+        (["--max-megabytes", "nan"], "--max-megabytes is nan"),
+        (["--max-megabytes", "inf"], "--max-megabytes is inf"),
         (["--port", "0", "--parts", "no-such-folder"], "no-such-folder is not a folder"),
         (["--port", "0", "--parts", "."], "holds no part"),
         (["--port", "0", "--example", "scan.ply"], "an example scan needs the parts"),
@@ -119,16 +130,28 @@ def test_a_port_in_use_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert re.match(rf"kmn: port {port} of 127.0.0.1 cannot be used \(.*in use\)", capsys.readouterr().err)
 
 
+def test_too_many_parts_are_refused_before_any_is_prepared(tmp_path: Path) -> None:
+    for number in range(3):
+        (tmp_path / f"{number}.stl").write_bytes(b"broken")
+    with pytest.raises(InputError, match="holds 3 parts, but at most 2 are kept"):
+        _prepared(KnownAnswer(), tmp_path, 2)
+
+
+def test_connections_are_kept_as_long_as_the_next_head_may_take() -> None:
+    assert uvicorn_config(None, ServeConfig(head_limit=7.2)).timeout_keep_alive == 8
+
+
 @contextmanager
-def other_server() -> Iterator[str]:
+def other_server(status: int, content: bytes, part: str = "/parts/a") -> Iterator[str]:
     """Serve something else."""
 
     class Other(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             self.rfile.read(int(self.headers["Content-Length"]))
-            self.send_response(200)
+            self.send_response(status)
+            self.send_header("Part", part)
             self.end_headers()
-            self.wfile.write(b"{}")
+            self.wfile.write(content)
 
         def log_message(self, *_: object) -> None:
             pass
@@ -171,6 +194,7 @@ def test_detect_sends_all_of_a_request_to_a_server(tmp_path: Path, capsys: pytes
         for changes, message in (
             ({"--object": tmp_path / "none.stl"}, "none.stl cannot be read"),
             ({"--weights": "other"}, "the server has weights of its own"),
+            ({"--grasps": scene}, "a server knows no robot"),
             ({"--roi": "1,2"}, "says: roi is '1,2', but must be 6 or 9 numbers"),
             ({"--server": "127.0.0.1:1"}, "is no address of a server"),
             ({"--server": url + "/elsewhere"}, "says: Not Found"),
@@ -180,8 +204,13 @@ def test_detect_sends_all_of_a_request_to_a_server(tmp_path: Path, capsys: pytes
             error = capsys.readouterr().err
             assert message in error
             assert error.count("\n") == 1
-    with other_server() as address:
-        assert main(["detect", *given, "--server", address]) == 2
-        assert f"the server at {address} does not answer as kmn serve does" in capsys.readouterr().err
+    deep = b"[" * 100_000
+    for status, content, path in ((200, b"{}", "@other.host/"), (200, b"{}", ""), (200, deep, "/"), (500, deep, "/")):
+        with other_server(status, content, path) as address:
+            assert main(["detect", *given, "--server", address]) == 2
+            error = capsys.readouterr().err
+            other = "does not answer as kmn serve does" if status == 200 else "says: it answered 500"
+            assert f"the server at {address} {other}" in error
+            assert error.count("\n") == 1
     assert main(["detect", *given, "--server", url]) == 2
     assert f"no answer from a server at {url}" in capsys.readouterr().err

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from kmn_jax.detection import THOROUGH, as_json
+from kmn_jax.objects import Part
 from kmn_jax.serve import ServeConfig
 from kmn_jax.serve._messages import DetectionResult, Health, PartInfo, PartList, Problem
 from kmn_jax.serve._searches import stored_name
-from tests.serve.serve_sample import FOUND, Running, running, some_scan
+from tests.serve.serve_sample import FOUND, KnownAnswer, Running, eventually, running, some_scan
 
 SCAN = ("scan.ply", some_scan())
 
@@ -43,6 +44,20 @@ def test_parts_are_prepared_listed_shown_replaced_and_deleted(server: Running) -
         assert server.ask("DELETE", f"/parts/{name}")[0] == 404
         assert server.ask("GET", f"/parts/{name}")[0] == 404
     assert server.ask("GET", "/parts")[1] == {"parts": []}
+
+
+def test_a_preparation_that_takes_too_long_is_not_lost(tmp_path: Path) -> None:
+    may_end = threading.Event()
+
+    class Slow(KnownAnswer):
+        def prepare(self, path: Any, unit: str | None = None, name: str | None = None) -> Part:
+            assert may_end.wait(30)
+            return super().prepare(path, unit, name)
+
+    with running(tmp_path, ServeConfig(port=0, time_limit=0.3), Slow()) as server:
+        assert server.send("PUT", "/parts/a", file=("a.stl", b"solid"))[0] == 504
+        may_end.set()
+        eventually(lambda: server.ask("GET", "/parts/a")[0] == 200)
 
 
 @pytest.mark.parametrize("name", [".hidden", "a%2Fb", "..%2F..%2Fetc", "%00", "a" * 65, "ß", "-"])
@@ -114,7 +129,16 @@ def test_a_picture_is_drawn_when_it_is_asked_for(server: Running) -> None:
 
 def test_files_are_written_into_the_private_folder_only_and_not_kept(server: Running, tmp_path: Path) -> None:
     del server.known.asked[:]
-    for name in ("../../escape.ply", "/etc/escape.ply", "..\\escape.ply", "..", "", ".ply", "a" * 300 + ".ply"):
+    for name in (
+        "../../escape.ply",
+        "/etc/escape.ply",
+        "..\\escape.ply",
+        "..",
+        "",
+        ".ply",
+        "a" * 300 + ".ply",
+        "語" * 99 + ".ply",
+    ):
         assert server.send("POST", "/detect", object=("a.stl", b"solid"), scene=(name, b"content"))[0] in (200, 422)
     assert server.known.asked
     for asked in server.known.asked:
@@ -134,11 +158,14 @@ def test_files_are_written_into_the_private_folder_only_and_not_kept(server: Run
         ("", "scene"),
         (".ply", "scene.ply"),
         ("a\n\x00:b.ply", "a___b.ply"),
-        ("a" * 300 + ".ply", "a" * 60 + ".ply"),
+        ("a" * 300 + ".ply", "a" * 30 + ".ply"),
+        ("語" * 99 + ".ply", "語" * 30 + ".ply"),
+        ("a." + "\U00020000" * 99, "a." + "\U00020000" * 30),
     ],
 )
 def test_names_of_files_are_made_safe(name: str, stored: str) -> None:
     assert stored_name(name, "scene") == stored
+    assert len(stored.encode()) <= 255
 
 
 def test_bad_input_is_one_sentence(server: Running, capfd: pytest.CaptureFixture[str]) -> None:
@@ -199,8 +226,11 @@ def test_metrics_count_requests_and_searches(server: Running) -> None:
     assert value("process_resident_memory_bytes") > 1e6
     for number in range(5):
         server.ask("GET", f"/made/up/{number}")
+        assert server.ask(f"MADEUP{number}", "/parts")[0] == 405
     text = server.ask("GET", "/metrics")[1].decode()
     assert "/made/up" not in text
+    assert "MADEUP" not in text
+    assert 'kmn_requests_total{method="other",route="/parts",status="405"}' in text
     assert 'kmn_requests_total{method="other",route="other",status="404"}' in text
 
 
@@ -243,9 +273,6 @@ def test_it_says_that_it_is_ready_when_all_is_compiled(tmp_path: Path) -> None:
         assert (status, headers["Retry-After"]) == (503, "5")
         assert "still compiling" in said["error"]
         compiled.set()
-        end = time.monotonic() + 20
-        while server.ask("GET", "/health")[0] != 200:
-            assert time.monotonic() < end
-            time.sleep(0.02)
+        eventually(lambda: server.ask("GET", "/health")[0] == 200)
         assert server.ask("GET", "/health")[1]["status"] == "ready"
         assert server.send("POST", "/detect", object=b"solid", scene=SCAN)[0] == 200

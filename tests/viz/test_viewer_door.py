@@ -13,8 +13,9 @@ import viser
 import websockets.sync.client
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from kmn_jax.errors import InputError
 from kmn_jax.viz import Viewer
-from kmn_jax.viz._viewer_server import Door
+from kmn_jax.viz._viewer_server import Door, start_server
 from tests.detection.box_sample import both_boxes, box_part, box_view
 
 PART = box_part()
@@ -111,5 +112,23 @@ def test_a_request_that_cannot_be_understood_is_refused() -> None:
     for wrong in ([*good, ("Host", "127.0.0.1:1")], [good[0], ("Cookie", 'a=";;;=')], [good[1]]):
         assert door.refusal(Headers(wrong), "/")
     assert door.refusal(Headers(good[:1]), f"/?token={door.token}") is None
-    assert door.refusal(Headers(good[:1]), "/?token=%00%ff")
+    for path in ("/?token=%00%ff", "/?token=\udcff", "//["):
+        assert door.refusal(Headers(good[:1]), path)
+    assert door.refusal(Headers(good), "//[")
     assert door.token not in repr(door)
+
+
+def test_a_page_that_the_door_does_not_guard_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    stopped = []
+
+    class Unguarded:
+        def __init__(self, **_: object) -> None:
+            pass
+
+        def stop(self) -> None:
+            stopped.append(self)
+
+    monkeypatch.setattr(viser, "ViserServer", Unguarded)
+    with pytest.raises(InputError, match="cannot be guarded by a token"):
+        start_server("127.0.0.1", 0)
+    assert len(stopped) == 1
