@@ -28,7 +28,7 @@ from benchmarks.endurance_frames import Frame, bin_frames, faulty, parts_of, sch
 from kmn_jax.detection import Detections, PoseEstimator
 from kmn_jax.errors import InputError
 from kmn_jax.objects import Part
-from kmn_jax.report import environment, print_table, write_json
+from kmn_jax.report import check_target, environment, print_table, write_json
 from kmn_jax.units import check_unit
 
 WARM = 200  # detections before the level of memory is taken
@@ -61,6 +61,7 @@ def main(detections: int = 10_000, hours: float = 1.0, seed: int = 0, json: Path
         seed: number that the order of frames and faults follows from.
         json: where the verdict and what it is made of goes.
     """
+    check_target(json)
     random, log = np.random.default_rng(seed), Log()
     estimator = PoseEstimator.from_pretrained()
     with tempfile.TemporaryDirectory(prefix="endurance-") as place:
@@ -68,6 +69,7 @@ def main(detections: int = 10_000, hours: float = 1.0, seed: int = 0, json: Path
         parts = parts_of(estimator)
         frames, bins = small_frames(parts, folder, random), bin_frames(folder)
         first = {frame.name: _detected(estimator, parts, frame) for frame in tqdm([*frames, *bins], desc="first")}
+        empty = _empty(first)
         begin = time.perf_counter()
         for frame, fault in tqdm(schedule(frames, bins, detections, random), total=detections, unit="detection"):
             if time.perf_counter() - begin > 3600 * hours:
@@ -76,10 +78,12 @@ def main(detections: int = 10_000, hours: float = 1.0, seed: int = 0, json: Path
         duration = time.perf_counter() - begin
     found = verdict(log, detections)
     print_table(f"{len(log.seconds)} detections in {duration / 60:.1f} min, seed {seed}", [found])
+    print(f"frames without a result, which get no faults: {', '.join(empty) or 'none'}")
     for line in (*log.untold[:20], *log.differing[:20]):
         print(line)
     curves: dict[str, list[float]] = {"seconds": log.seconds, "megabytes": log.megabytes}
-    write_json(json, {**environment(), "seed": seed, "duration": duration, "verdict": found, **_thinned(curves)})
+    facts = {"seed": seed, "duration": duration, "empty": empty, "verdict": found}
+    write_json(json, {**environment(), **facts, **_thinned(curves)})
     return 0 if found["holds"] else 1
 
 
@@ -134,6 +138,14 @@ def trend(values: Float[np.ndarray, " n"], shuffles: int = _SHUFFLES) -> tuple[f
     return change(stretches), float(np.quantile(chance, 0.99))
 
 
+def _empty(first: dict[str, bytes | str]) -> list[str]:
+    """Return the frames in which nothing is found without a fault. Raises InputError if all are."""
+    empty = [name for name, found in first.items() if isinstance(found, str)]
+    if len(empty) == len(first):
+        raise InputError("nothing is found in any frame, so that no fault would be noticed")
+    return empty
+
+
 def _step(
     estimator: PoseEstimator,
     parts: dict[str, Part],
@@ -144,6 +156,8 @@ def _step(
     log: Log,
 ) -> None:
     number = len(log.seconds)
+    if isinstance(first[frame.name], str):  # nothing is found in it anyway: any fault would pass for told
+        fault = None
     given = frame if fault is None else faulty(frame, fault, folder, parts)
     start = time.perf_counter()
     found = _detected(estimator, parts, given)
@@ -196,4 +210,8 @@ def _thinned(curves: dict[str, list[float]]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    sys.exit(tyro.cli(main))
+    try:
+        sys.exit(tyro.cli(main))
+    except InputError as error:
+        print(f"endurance: {error}", file=sys.stderr)
+        sys.exit(2)

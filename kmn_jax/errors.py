@@ -18,6 +18,17 @@ class InputError(ValueError):
     """The caller's input cannot be used. The message is one sentence for people."""
 
 
+def shown(value: object, most: int = 120) -> str:
+    """Return what a sentence quotes, a damaged file's words or a library's: one line of at most `most` characters.
+
+    An InputError is quoted whole, as it has cut what it quotes.
+    """
+    if isinstance(value, InputError):
+        return str(value)
+    text = " ".join(str(value).split())
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
 def require(condition: bool, message: str) -> None:
     """Raise InputError with `message` unless the condition holds; for the checks of configs."""
     if not condition:

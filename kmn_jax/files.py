@@ -17,7 +17,8 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, shown
+from kmn_jax.limits import parse_json
 
 if sys.platform != "win32":
     import fcntl
@@ -60,11 +61,13 @@ def _remove_left_over(target: Path) -> None:
     """Remove temporary files of a target that no process holds locked, or made just now and is about to lock."""
     name = re.compile(rf"\.{re.escape(target.name[:100])}\.[0-9a-f]{{16}}")
     with contextlib.suppress(OSError):  # another process may be as quick, and not every folder can be listed
-        for path in filter(lambda path: name.fullmatch(path.name), target.parent.iterdir()):
-            if time.time() - path.stat().st_mtime > _SECONDS_TO_LOCK:
-                with path.open("rb") as file:
+        with os.scandir(target.parent) as entries:
+            left = [entry for entry in entries if name.fullmatch(entry.name) and entry.is_file(follow_symlinks=False)]
+        for entry in left:
+            if time.time() - entry.stat(follow_symlinks=False).st_mtime > _SECONDS_TO_LOCK:
+                with open(entry.path, "rb") as file:
                     if _lock(file):
-                        path.unlink()
+                        os.unlink(entry.path)
 
 
 def _lock(file: BinaryIO) -> bool:
@@ -96,7 +99,7 @@ def safetensors_bytes(tensors: dict[str, np.ndarray], metadata: dict[str, str] |
     metadata = metadata if tensors else metadata or None  # of nothing at all, the library writes no JSON
     content = save({name: np.ascontiguousarray(array) for name, array in tensors.items()}, metadata)
     start = 8 + int.from_bytes(content[:8], "little")
-    header = json.loads(content[8:start])
+    header = parse_json(content[8:start])
     if metadata:  # which come in no order
         header["__metadata__"] = dict(sorted(metadata.items()))
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
@@ -111,4 +114,4 @@ def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str,
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a mapping)
             return tensors, file.metadata() or {}
     except (SafetensorError, OSError, AttributeError, TypeError) as error:  # the latter two: dtypes NumPy lacks
-        raise InputError(f"{path} is not a readable safetensors file: {error}") from None
+        raise InputError(f"{path} is not a readable safetensors file: {shown(error)}") from None

@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable
 from typing import Any
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, shown
 
 SETTING = "KMN_MOST_BYTES"
 _MOST_BYTES = 2_000_000_000
@@ -65,7 +65,7 @@ def parse_json(text: str | bytes, make_object: Callable[[list[tuple[str, Any]]],
     try:
         found = json.loads(text, object_pairs_hook=make_object)
     except ValueError as error:
-        raise InputError(str(error).partition("\n")[0][:120]) from None
+        raise InputError(shown(error)) from None
     except RecursionError:
         raise InputError(f"it is nested deeper than {_DEEPEST} levels") from None
     if containers > _DEEPEST:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, shown
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}  # one of each unit, in metres
 _DECIMALS = {"m": 4, "cm": 2, "mm": 1, "in": 3}  # to a tenth of a millimetre
@@ -22,7 +22,7 @@ else:
 def check_unit(unit: str) -> Unit:
     """Return a known unit of length, or raise InputError."""
     if unit not in METRES:
-        raise InputError(f"unit {unit!r} is not known: use one of {', '.join(METRES)}")
+        raise InputError(f"unit {shown(repr(unit))} is not known: use one of {', '.join(METRES)}")
     return unit  # type: ignore[return-value]
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.errors import InputError, float_array, index_array, mask_array, positive_scalar, rigid_pose
+from kmn_jax.errors import InputError, float_array, index_array, mask_array, positive_scalar, rigid_pose, shown
 
 
 @pytest.mark.parametrize("value", [[[1.0, 2.0]], np.ones((1, 2)), np.ones((1, 2), np.float16), jnp.ones((1, 2))])
@@ -32,6 +32,13 @@ def test_what_is_an_array_is_taken(value: object) -> None:
 def test_what_is_not_is_refused_in_a_sentence(value: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
         float_array(value, "x", (None, 2))
+
+
+def test_what_is_quoted_is_one_short_line() -> None:
+    assert shown(ValueError("a\n b")) == "a b"
+    assert shown("a" * 120) == "a" * 120
+    assert shown("a" * 121, 10) == "aaaaaaa..."
+    assert shown(InputError("a" * 1000)) == "a" * 1000  # our own sentence
 
 
 def test_padding_may_hold_anything() -> None:

@@ -69,20 +69,25 @@ def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
         "write_whole(sys.argv[1], b'half')\n"
     )
     subprocess.run([sys.executable, "-c", program, tmp_path / "a.bin"], check=False)
+    assert not (tmp_path / "a.bin").exists()
     (left,) = tmp_path.iterdir()
     assert left.name.startswith(".a.bin.")
     other = tmp_path / f".a.bin.txt.{'0' * 16}"
     other.write_bytes(b"of another target")
+    folder = tmp_path / f".a.bin.{'1' * 16}"  # which is not of this making, nor a link
+    folder.mkdir()
+    link = tmp_path / f".a.bin.{'2' * 16}"
+    link.symlink_to(other)
     write_whole(tmp_path / "a.bin", b"too soon to tell")
     assert left.exists()
-    for path in (left, other):
+    for path in (left, other, folder):
         os.utime(path, (time.time() - 60,) * 2)
     with left.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_SH)
         write_whole(tmp_path / "a.bin", b"another process is at it")
         assert left.exists()
     write_whole(tmp_path / "a.bin", b"whole")
-    assert {path.name for path in tmp_path.iterdir()} == {"a.bin", other.name}
+    assert {path.name for path in tmp_path.iterdir()} == {"a.bin", other.name, folder.name, link.name}
     assert (tmp_path / "a.bin").read_bytes() == b"whole"
 
 

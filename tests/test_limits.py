@@ -14,10 +14,11 @@ from kmn_jax.bop._files import read_json
 from kmn_jax.data import Pack
 from kmn_jax.detection._calibration import load_probabilities
 from kmn_jax.errors import InputError
+from kmn_jax.io import read_pose
 from kmn_jax.io._scans import read_camera
 from kmn_jax.limits import SETTING, check_bytes, check_elements, most_bytes, most_elements, parse_json
 from kmn_jax.models import load_model
-from kmn_jax.objects import load_part
+from kmn_jax.objects import load_grasps, load_part
 
 PACKAGE = Path(__file__).parent.parent / "kmn_jax"
 
@@ -94,6 +95,8 @@ READERS: dict[str, Callable[[Path, str], object]] = {
     "camera": lambda path, text: read_camera(plain(path, text)),
     "card": card,
     "model": lambda path, text: load_model(safetensors(path, {"kmn_jax.config": text})),
+    "pose": lambda path, text: read_pose(plain(path, text), "T_base_camera"),
+    "grasps": lambda path, text: load_grasps(plain(path, text)),
     "calibration": lambda path, text: load_probabilities(plain(path, text), ("a",)),
     "pack": lambda path, text: Pack(plain(path / "manifest.json", text).parent),
     "dataset": lambda path, text: read_json(plain(path, text)),

@@ -52,7 +52,7 @@ def test_wheel_and_sdist_are_whole_and_the_wheel_imports_in_an_empty_environment
     assert {Path(name).name for name in names if "/licenses/" in name} == {"LICENSE", "NOTICE"}
     assert not any(name.startswith(("tests/", "experiments/")) for name in names)
     assert "License-Expression: Apache-2.0" in said
-    assert "kmn = kmn_jax.cli:main" in commands
+    assert "kmn = kmn_jax.__main__:main" in commands
     with tarfile.open(sdist) as archive:
         inside = {name.partition("/")[2] for name in archive.getnames()}
     assert {"pyproject.toml", "CHANGELOG.md", "LICENSE", "NOTICE", "kmn_jax/__init__.py", "tests/conftest.py"} <= inside

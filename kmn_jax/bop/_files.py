@@ -260,5 +260,5 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result = dict(pairs)
     if len(result) < len(pairs):
         keys = [key for key, _ in pairs]
-        raise ValueError(f"two values for the key {next(key for key in keys if keys.count(key) > 1)!r}")
+        raise ValueError(f"two values for the key {next(key for key in keys if keys.count(key) > 1)[:80]!r}")
     return result

@@ -12,17 +12,19 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, TimeoutError, wait
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from kmn_jax.data._pack import VERSION, Entry, read_entry, write_manifest, write_object
 from kmn_jax.data._recipe import PackConfig, pack_object
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, shown
 from kmn_jax.limits import parse_json
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -168,12 +170,12 @@ class _Journal:
         lines = path.read_bytes().split(b"\n") if path.exists() else []
         whole = [line for line in lines[:-1] if line]  # what follows the last line's end was cut off
         if whole:
-            if self._parsed(whole[0]).get("recipe") != header["recipe"]:
+            if self._parsed(whole[0], dict).get("recipe") != header["recipe"]:
                 raise InputError(
                     f"{path} records a build by another recipe: choose another folder, or delete {path.parent}"
                 )
             for line in whole[1:]:
-                record = _record(self._parsed(line))
+                record = self._parsed(line, _record)
                 self.records[record.name] = record
             with path.open("r+b") as file:
                 file.truncate(sum(len(line) + 1 for line in lines[:-1]))
@@ -187,13 +189,17 @@ class _Journal:
             file.flush()
             os.fsync(file.fileno())
 
-    def _parsed(self, line: bytes) -> dict[str, Any]:
+    def _parsed(self, line: bytes, make: Callable[[Any], _T]) -> _T:
         try:
-            return dict(parse_json(line))
-        except (ValueError, TypeError) as error:
-            raise InputError(f"{self.path} is damaged ({error}): delete {self.path.parent} and build again") from None
+            return make(parse_json(line))
+        except (ValueError, TypeError, KeyError) as error:
+            reason = f"{type(error).__name__}: {shown(error)}"
+            raise InputError(f"{self.path} is damaged ({reason}): delete {self.path.parent} and build again") from None
 
 
 def _record(fields: dict[str, Any]) -> Record:
-    entry = fields.pop("entry")
-    return Record(entry=read_entry(entry) if entry else None, **fields)
+    entry = fields["entry"]
+    record = Record(**{**fields, "entry": read_entry(entry) if entry else None})
+    if not all(isinstance(text, str) for text in (record.name, record.split, record.reason or "")):
+        raise TypeError("a name, split or reason is no text")
+    return record

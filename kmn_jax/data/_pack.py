@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int8, Int16, UInt8
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, shown
 from kmn_jax.files import read_safetensors, safetensors_bytes, write_whole
 from kmn_jax.geometry import Camera
 from kmn_jax.limits import parse_json
@@ -84,8 +84,9 @@ class Pack:
         try:
             self.entries = {entry.name: entry for entry in map(read_entry, self.manifest["objects"])}
         except (KeyError, TypeError, ValueError) as error:
+            reason = shown(repr(error))
             raise InputError(
-                f"{self.folder / 'manifest.json'}: an entry of 'objects' is broken ({error!r}): build the pack again"
+                f"{self.folder / 'manifest.json'}: an entry of 'objects' is broken ({reason}): build the pack again"
             ) from None
 
     def names(self, split: str | None = None) -> list[str]:
@@ -100,14 +101,16 @@ class Pack:
         Raises InputError naming the file if it is missing, or differs from its checksum.
         """
         if name not in self.entries:
-            raise InputError(f"{self.folder} has no object {name!r}: its manifest lists {len(self.entries)} others")
+            raise InputError(
+                f"{self.folder} has no object {shown(repr(name))}: its manifest lists {len(self.entries)} others"
+            )
         entry = self.entries[name]
         path = self.folder / entry.objects.path
         result = _decode(*read_safetensors(self._checked(entry.objects)), path)
         if result.name != name:
             raise InputError(
-                f"{path} holds the object {result.name!r}, but the manifest calls it {name!r}: build or copy the pack"
-                " again"
+                f"{path} holds the object {shown(repr(result.name))}, but the manifest calls it {shown(repr(name))}:"
+                " build or copy the pack again"
             )
         if not visibility or entry.visibility is None:
             return result
@@ -187,7 +190,8 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is not the manifest of a pack: its 'format' is not {FORMAT!r}")
     if manifest.get("version") != VERSION:
         raise InputError(
-            f"{path} has version {manifest.get('version')}, but this kmn_jax reads version {VERSION}: build it again"
+            f"{path} has version {shown(manifest.get('version'))}, but this kmn_jax reads version {VERSION}:"
+            " build it again"
         )
     if not isinstance(manifest.get("objects"), list):
         raise InputError(f"{path} has no list 'objects': build or copy the pack again")
@@ -203,13 +207,13 @@ def read_entry(fields: dict[str, Any]) -> Entry:
     for shard in filter(None, (entry.objects, entry.visibility)):
         _check_inside(shard.path)
     if entry.split not in SPLITS:
-        raise ValueError(f"split {entry.split!r} is not one of {', '.join(SPLITS)}")
+        raise ValueError(f"split {shown(repr(entry.split))} is not one of {', '.join(SPLITS)}")
     return entry
 
 
 def _check_inside(path: str) -> None:
     if Path(path).is_absolute() or ".." in Path(path).parts:
-        raise InputError(f"path {path!r} leaves the pack")
+        raise InputError(f"path {shown(repr(path))} leaves the pack")
 
 
 def _write_shard(folder: Path, kind: str, name: str, tensors: dict[str, np.ndarray], metadata: dict[str, str]) -> Shard:
@@ -288,8 +292,8 @@ def _decode(tensors: dict[str, np.ndarray], metadata: dict[str, str], path: Path
             drops=tuple(drops),
             digest=facts["digest"],
         )
-    except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise InputError(f"{path} is not an object of a pack ({error!r}): build it again") from None
+    except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{path} is not an object of a pack ({shown(repr(error))}): build it again") from None
 
 
 def _poses(rotations: Float[np.ndarray, "n 3 3"], translations: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4 4"]:

@@ -8,7 +8,7 @@ import warnings
 import numpy as np
 from jaxtyping import Float64
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, shown
 from kmn_jax.io._lzf import unpack_lzf
 from kmn_jax.io._text import parse_numbers
 from kmn_jax.limits import check_bytes, check_elements
@@ -29,7 +29,7 @@ def parse_xyz(content: bytes, with_normals: bool) -> Cloud:
             warnings.simplefilter("ignore")  # of no data
             table = np.loadtxt(io.BytesIO(content), dtype=np.float64, ndmin=2, encoding="latin-1")
     except (ValueError, OverflowError) as error:
-        raise InputError(f"it is not a table of numbers: {str(error).split(';')[0]}") from None
+        raise InputError(f"it is not a table of numbers: {shown(str(error).split(';')[0])}") from None
     if table.size and table.shape[1] < columns:
         raise InputError(f"it has {table.shape[1]} numbers a line, but {columns} are needed")
     table = table.reshape(-1, max(columns, table.shape[1]))
@@ -48,7 +48,9 @@ def parse_pcd(content: bytes) -> Cloud:
     except InputError:
         raise
     except (ValueError, TypeError, KeyError, IndexError, OverflowError) as error:
-        raise InputError(f"it is truncated or damaged, or not a PCD file ({type(error).__name__}: {error})") from None
+        raise InputError(
+            f"it is truncated or damaged, or not a PCD file ({type(error).__name__}: {shown(error)})"
+        ) from None
     if not {"x", "y", "z"} <= named.keys():
         raise InputError("its points have no x, y and z")
     points = np.stack([named[name] for name in ("x", "y", "z")], axis=1).astype(np.float64)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from kmn_jax.errors import InputError, rigid_pose
+from kmn_jax.errors import InputError, rigid_pose, shown
 from kmn_jax.io._meshes import read_file
+from kmn_jax.limits import parse_json
 from kmn_jax.typing import ArrayInput
 from kmn_jax.units import METRES, Unit, check_unit
 
@@ -25,12 +25,12 @@ def read_pose(path: str | Path, name: str) -> tuple[Float64[np.ndarray, "4 4"], 
     path = Path(path)
     content = read_file(path, "a file with a pose")
     try:
-        found = json.loads(content.decode("utf-8"))
+        found = parse_json(content.decode("utf-8"))
         if not isinstance(found, dict):
             return pose_matrix(found, name), None
         return pose_of(found, name), None if found.get("unit") is None else check_unit(str(found["unit"]))
-    except (ValueError, RecursionError) as error:  # InputError is one
-        raise InputError(f"{path} cannot be used as a pose: {error}") from None
+    except ValueError as error:  # InputError is one
+        raise InputError(f"{path} cannot be used as a pose: {shown(error)}") from None
 
 
 def pose_of(values: Mapping[str, Any], name: str) -> Float64[np.ndarray, "4 4"]:
@@ -58,7 +58,7 @@ def pose_matrix(value: ArrayInput, name: str) -> Float64[np.ndarray, "4 4"]:
     """Return a rigid pose in double precision, or raise InputError."""
     try:
         pose = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{name} is no matrix of 4 x 4 numbers") from None
     rigid_pose(pose, name)
     return pose
@@ -74,7 +74,7 @@ def in_other_unit(pose: Float64[np.ndarray, "4 4"], unit: str, other: str) -> Fl
 def _numbers(value: Any, name: str, count: int) -> Float64[np.ndarray, " n"]:
     try:
         numbers = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.zeros(0)
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
         raise InputError(f"{name} must be {count} finite numbers")

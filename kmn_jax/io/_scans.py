@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, shown
 from kmn_jax.geometry import Camera, measured_points
 from kmn_jax.io._exr import parse_exr
 from kmn_jax.io._images import image_header, read_image
@@ -128,7 +128,7 @@ def read_camera(path: str | Path) -> DepthCamera:
     except KeyError as error:
         raise InputError(f"{path} cannot be used: it has no {error}, give fx, fy, cx and cy, or cam_K") from None
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{path} cannot be used as a camera: {error}") from None
+        raise InputError(f"{path} cannot be used as a camera: {shown(error)}") from None
 
 
 def _intrinsics(matrix: np.ndarray, name: str, scale: float, size: tuple[int, int] | None) -> DepthCamera:
@@ -191,7 +191,10 @@ def _npy(content: bytes) -> np.ndarray:
     if min(shape, default=0) < 0 or count * dtype.itemsize > len(content) - file.tell():
         raise InputError(f"it is not a readable .npy file: it is truncated, or not of shape {shape}"[:200])
     array = np.frombuffer(content, dtype, count, file.tell()) if count else np.zeros(0, dtype)
-    return array.reshape(shape, order="F" if by_columns else "C")
+    try:
+        return array.reshape(shape, order="F" if by_columns else "C")
+    except ValueError:  # of nothing, in a shape beyond NumPy's bounds
+        raise InputError(f"it is not a readable .npy file: it is damaged, its shape is {shape}"[:200]) from None
 
 
 def _npz(content: bytes) -> dict[str, np.ndarray]:

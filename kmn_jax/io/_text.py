@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float64
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, shown
 from kmn_jax.limits import check_bytes
 
 _PIECE = 1 << 20  # bytes
@@ -35,5 +35,5 @@ def parse_numbers(text: bytes) -> Float64[np.ndarray, " n"]:
         try:
             found.append(np.fromiter(map(float, words), np.float64, len(words)))
         except ValueError as error:
-            raise InputError(f"it is damaged: {str(error)[:80]}") from None
+            raise InputError(f"it is damaged: {shown(error, 80)}") from None
     return np.concatenate(found)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from kmn_jax.errors import InputError, require
+from kmn_jax.errors import InputError, require, shown
 from kmn_jax.models._layers import Compute
 from kmn_jax.models._pair_head import PairDropout
 
@@ -63,13 +63,15 @@ class KeyMatchNetConfig:
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
-                raise InputError(f"{name} is {getattr(self, name)!r}, but must be one of {', '.join(choices)}")
+                raise InputError(
+                    f"{name} is {shown(repr(getattr(self, name)))}, but must be one of {', '.join(choices)}"
+                )
         sizes = ("num_scene_points", "num_object_points", "num_keypoints", "num_neighbors", "groups")
         widths = ("edge_width", "embedding_width", "scene_width", "object_width", "pair_width")
         for name in (*sizes, *widths):
             size = getattr(self, name)
             if not isinstance(size, int) or size < 1:
-                raise InputError(f"{name} is {size!r}, but must be a whole number, at least 1")
+                raise InputError(f"{name} is {shown(repr(size))}, but must be a whole number, at least 1")
             if name in widths and size % self.groups:
                 raise InputError(f"{name} is {size}, but must be a multiple of groups = {self.groups}")
         require(0 <= self.dropout < 1, f"dropout is {self.dropout}, but must be in [0, 1)")

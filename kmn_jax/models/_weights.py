@@ -11,7 +11,7 @@ import numpy as np
 from flax import nnx
 from safetensors import SafetensorError, safe_open
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, shown
 from kmn_jax.files import read_safetensors, safetensors_bytes, write_whole
 from kmn_jax.limits import parse_json
 from kmn_jax.models._config import KeyMatchNetConfig
@@ -68,7 +68,7 @@ def load_model(path: str | Path) -> Model:
     try:
         config = KeyMatchNetConfig(**parse_json(metadata[_CONFIG_KEY]))
     except (TypeError, ValueError) as error:
-        raise InputError(f"{path} has a config that this version of kmn_jax cannot use: {error}") from None
+        raise InputError(f"{path} has a config that this version of kmn_jax cannot use: {shown(error)}") from None
     graphdef, parameters = model_structure(config)
     flat = dict(nnx.to_flat_state(parameters))
     wanted = {".".join(map(str, target)): target for target in flat}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, shown
 from kmn_jax.io import in_other_unit, pose_of, read_file
+from kmn_jax.limits import parse_json
 from kmn_jax.units import METRES, check_unit
 
 
@@ -85,10 +86,10 @@ def load_grasps(path: str | Path) -> Grasps:
     path = Path(path)
     content = read_file(path, "a file of grasps")
     try:
-        found = json.loads(content.decode("utf-8"))
+        found = parse_json(content.decode("utf-8"))
         return _grasps(_object(found, "the file", {"unit", "gripper", "grasps"}))
-    except (ValueError, RecursionError) as error:  # InputError is one
-        raise InputError(f"{path} cannot be used as grasps: {error}") from None
+    except ValueError as error:  # InputError is one
+        raise InputError(f"{path} cannot be used as grasps: {shown(error)}") from None
 
 
 def _grasps(found: Mapping[str, Any]) -> Grasps:
@@ -134,7 +135,9 @@ def _object(value: Any, name: str, known: set[str]) -> dict[str, Any]:
         raise InputError(f"{name} must be an object with {', '.join(sorted(known))}")
     unknown = sorted(value.keys() - known)
     if unknown:
-        raise InputError(f"{name} has {unknown[0]!r}, which is not known: it may have {', '.join(sorted(known))}")
+        raise InputError(
+            f"{name} has {shown(repr(unknown[0]))}, which is not known: it may have {', '.join(sorted(known))}"
+        )
     return value
 
 
@@ -147,7 +150,7 @@ def _list(value: Any, name: str) -> list[Any]:
 def _numbers(value: Any, name: str, above_zero: bool = False) -> Float[np.ndarray, "3"]:
     try:
         numbers = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.zeros(0)
     if numbers.shape != (3,) or not np.isfinite(numbers).all() or (above_zero and not (numbers > 0).all()):
         raise InputError(f"the {name} must be three numbers{' above zero' if above_zero else ''}, x, y and z")
@@ -155,6 +158,7 @@ def _numbers(value: Any, name: str, above_zero: bool = False) -> Float[np.ndarra
 
 
 def _number(value: Any, name: str, least: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value) or value < least:
+    real = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    if not real or value < least:
         raise InputError(f"the {name} must be a number{'' if least < 0 else ' of zero or more'}")
     return float(value)

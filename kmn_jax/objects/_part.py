@@ -14,7 +14,7 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, shown
 from kmn_jax.files import read_safetensors, safetensors_bytes, write_whole
 from kmn_jax.io import far_origin
 from kmn_jax.limits import parse_json
@@ -193,7 +193,7 @@ def load_part(path: str | Path, digest: str | None = None) -> Part:
         facts = dict(parse_json(metadata["facts"]))
         part = _part(tensors, facts)
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path} is a damaged object card ({error}): make it again with kmn prepare") from None
+        raise InputError(f"{path} is a damaged object card ({shown(error)}): make it again with kmn prepare") from None
     if digest is not None and part.model_digest != digest:
         raise InputError(
             f"{path} was made by other weights than those in use: make it again with kmn prepare CAD_FILE -o {path},"
@@ -223,8 +223,10 @@ def _part(tensors: dict[str, np.ndarray], facts: dict[str, object]) -> Part:
     features = array("features", None, None).astype(np.float32)
     if not 1 <= len(features) <= len(points):
         raise ValueError(f"{len(features)} keypoints of {len(points)} points")
-    normals = array("normals", len(points), 3).astype(np.float32)
-    if not np.allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-3):
+    with np.errstate(over="ignore"):
+        normals = array("normals", len(points), 3).astype(np.float32)
+        lengths = np.linalg.norm(normals, axis=1)
+    if not np.allclose(lengths, 1, atol=1e-3):
         raise ValueError("normals that are not of unit length")
     minimum, maximum = (array(name, 3).astype(np.float64) for name in ("minimum", "maximum"))
     if not (minimum <= maximum).all():

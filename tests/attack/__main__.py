@@ -20,7 +20,7 @@ import tyro
 from tqdm import tqdm
 
 from kmn_jax.errors import InputError
-from kmn_jax.report import commit, print_table, processor, write_json
+from kmn_jax.report import check_target, commit, print_table, processor, write_json
 from tests.attack.bombs import bombs
 from tests.attack.cases import (
     BAD,
@@ -61,6 +61,7 @@ def main(
     """
     if replay is not None:
         return _replay(replay, keep)
+    check_target(json)
     chosen = planned(cases, seed, only)
     start = time.perf_counter()
     found: list[Outcome] = []

@@ -28,7 +28,7 @@ def bombs() -> dict[str, tuple[Bomb, ...]]:
     """Return files by the format that they are of; they are made when they are called."""
     deep = tuple(partial(_constant, text) for text in (b"[" * _DEEP, b'{"a":' * _DEEP, b"[" * 900 + b"]" * 900))
     numbers = partial(_constant, b"9" * 10**6)
-    json_files = ("camera", "camera-matrix", "calibration", "pack-manifest", "recipe", "poses-json")
+    json_files = ("camera", "camera-matrix", "calibration", "pack-manifest", "recipe", "poses-json", "pose", "grasps")
     of_bop = [f"bop-{name}" for name in ("scene-gt", "scene-camera", "scene-gt-info", "models-info", "camera")]
     bop = (*deep, numbers, partial(_constant, b'{"' + b"1" * 5000 + b'": 1}'))
     return {
@@ -229,9 +229,10 @@ def _torch() -> dict[str, bytes]:
         return zip_members(path.read_bytes())
 
 
-def _repickled(content: bytes, **more: bytes) -> bytes:
+def _repickled(content: bytes) -> bytes:
+    """Return a torch file with another pickle; stored, as a compressed one is refused before its pickle is read."""
     names = {name.rpartition("/")[2]: name for name in _torch()}
-    return zip_bytes({**_torch(), names["data.pkl"]: content, **more}, packed=True)
+    return zip_bytes({**_torch(), names["data.pkl"]: content}, packed=False)
 
 
 def _long_pickle() -> bytes:

@@ -75,7 +75,9 @@ def mutated_zip(content: bytes, random: Random) -> bytes:
             members[random.choice(("", "../a", "a" * 1000, name.upper()))] = members.pop(name)
         case "other":
             members[name] = members[random.choice(list(members))]
-    return zip_bytes(members, random.random() < 0.5)
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:  # what is compressed is refused by some readers at once
+        packed = archive.infolist()[0].compress_type == zipfile.ZIP_DEFLATED
+    return zip_bytes(members, packed)
 
 
 def mutated_png(content: bytes, random: Random) -> bytes:

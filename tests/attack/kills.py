@@ -25,7 +25,7 @@ import tyro
 from tqdm import tqdm
 
 from kmn_jax.errors import InputError
-from kmn_jax.report import commit, print_table, processor, write_json
+from kmn_jax.report import check_target, commit, print_table, processor, write_json
 from tests.attack.activities import ACTIVITIES, Activity
 from tests.train.loop_sample import ENVIRONMENT, ONE_DEVICE
 
@@ -61,6 +61,7 @@ def main(kills: int = 200, seed: int = 0, json: Path | None = None, only: str = 
     chosen = {name: activity for name, activity in ACTIVITIES.items() if only in ("", name)}
     if not chosen:
         raise InputError(f"there is no activity {only!r}: there are {', '.join(ACTIVITIES)}")
+    check_target(json)
     start, tallies = time.perf_counter(), []
     with tqdm(total=kills, unit="kill") as bar:
         for row, (name, activity) in enumerate(chosen.items()):

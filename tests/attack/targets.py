@@ -18,11 +18,11 @@ from kmn_jax.data import Pack
 from kmn_jax.detection._calibration import load_probabilities
 from kmn_jax.detection._evidence import EVIDENCE
 from kmn_jax.errors import InputError
-from kmn_jax.io import read_mesh, read_scan
+from kmn_jax.io import read_mesh, read_pose, read_scan
 from kmn_jax.io._meshes import CLOUD_SUFFIXES
 from kmn_jax.io._scans import read_camera
 from kmn_jax.models import load_model, load_released, released_file
-from kmn_jax.objects import ObjectConfig, load_object, load_part
+from kmn_jax.objects import ObjectConfig, load_grasps, load_object, load_part
 from kmn_jax.train import read_metrics
 from kmn_jax.train._checkpoint import Checkpoints
 from tests.attack import containers, mutations, samples
@@ -151,6 +151,8 @@ def _one(write: Callable[[Path], None], name: str) -> Callable[[Path], None]:
     return lambda folder: write(folder / name)
 
 
+_NAME = "T_base_camera"
+_POSE = [[0.0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]]
 _TEXT = (mutations.mutated_numbers, mutations.mutated_lines)
 _JSON = (mutations.mutated_tree, mutations.mutated_tree, mutations.mutated_numbers)
 _ROWS = (mutations.mutated_rows, mutations.mutated_rows, mutations.mutated_numbers)
@@ -250,6 +252,9 @@ def targets() -> dict[str, Target]:
         Target("metrics", _one(_metrics, "metrics.jsonl"), ("*",), lambda folder, _: read_metrics(folder), 0.3, _ROWS),
         Target("predictions", evaluation_folder, ("*/*.safetensors",), _predictions, 0.6, _TENSORS),
         Target("recipe", evaluation_folder, ("recipe.json",), _predictions, 0.4, _JSON),
+        Target("pose", _one(_pose, "a.json"), ("a.json",), lambda _, path: read_pose(path, _NAME), 0.5, _JSON),
+        Target("pose-xyzw", _one(_place, "a.json"), ("a.json",), lambda _, path: read_pose(path, _NAME), 0.5, _JSON),
+        Target("grasps", _one(_grasps, "a.json"), ("a.json",), lambda _, path: load_grasps(path), 1, _JSON),
         Target("poses-json", _one(_poses, "a.json"), ("a.json",), lambda _, path: read_poses(path), 0.4, _JSON),
         Target("poses-txt", _one(_poses, "a.txt"), ("a.txt",), lambda _, path: read_poses(path), 0.3, _TEXT),
     ]
@@ -274,6 +279,26 @@ def _metrics(path: Path) -> None:
 
 
 def _poses(path: Path) -> None:
-    pose = [[0.0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]]
-    text = " ".join(str(number) for row in pose for number in row)
-    path.write_text(json.dumps({"poses": [{"T_scene_object": pose}, pose]}) if path.suffix == ".json" else text)
+    text = " ".join(str(number) for row in _POSE for number in row)
+    path.write_text(json.dumps({"poses": [{"T_scene_object": _POSE}, _POSE]}) if path.suffix == ".json" else text)
+
+
+def _pose(path: Path) -> None:
+    path.write_text(json.dumps({_NAME: _POSE, "unit": "mm"}))
+
+
+def _place(path: Path) -> None:
+    path.write_text(json.dumps({"xyz": [0.5, 0, 1], "xyzw": [1, 0, 0, 0], "unit": "m"}))
+
+
+def _grasps(path: Path) -> None:
+    gripper = {
+        "boxes": [{"center": [0, 0, -25], "size": [10, 10, 50]}],
+        "fingers": {"size": [4, 12, 40], "reach": 3},
+        "approach": 80,
+    }
+    ways = [
+        {"name": "side", "width": 20, "xyz": [18, 0, -10], "xyzw": [0, 0, 0, 1]},
+        {"width": 30, "T_object_grasp": _POSE},
+    ]
+    path.write_text(json.dumps({"unit": "mm", "gripper": gripper, "grasps": ways}))

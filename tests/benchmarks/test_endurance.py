@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks import endurance
-from benchmarks.endurance import Log, _step, relative_seconds, trend, verdict
+from benchmarks.endurance import Log, _empty, _step, relative_seconds, trend, verdict
 from benchmarks.endurance_frames import FAULTS, Frame, bin_frames, faulty, schedule, small_frames
 from kmn_jax.errors import InputError
 from kmn_jax.io import read_scan
+from tests.attack import __main__ as attack
+from tests.attack import kills
 from tests.reference.parts import box_part
 
 RANDOM = np.random.default_rng(0)
@@ -91,6 +94,25 @@ def test_the_schedule_has_all_kinds_and_faults(frames: list[Frame]) -> None:
     assert {fault for _, fault in drawn} == {None, *FAULTS}
     assert {frame.name for frame, _ in drawn} == {frame.name for frame in frames}
     assert sum(frame.at is None for frame, _ in drawn) < 100
+
+
+def test_frames_in_which_nothing_is_found_get_no_faults(
+    frames: list[Frame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert _empty({"a": b"bits", "b": "no pose"}) == ["b"]
+    with pytest.raises(InputError, match="nothing is found in any frame"):
+        _empty({"b": "no pose"})
+    monkeypatch.setattr(endurance, "_detected", lambda *_: "no pose")
+    log = Log()
+    _step(None, {}, frames[0], "empty", tmp_path, {frames[0].name: "no pose"}, log)  # type: ignore[arg-type]
+    assert (log.faults.total(), log.untold, log.differing) == (0, [], [])
+
+
+@pytest.mark.parametrize("run", [endurance.main, attack.main, kills.main])
+def test_a_place_for_results_is_made_before_what_takes_time(run: Callable[..., int], tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(InputError, match="cannot make the folder"):
+        run(json=tmp_path / "file" / "a.json")
 
 
 def test_faults_that_are_not_told_and_other_bits_are_noted(

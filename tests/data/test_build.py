@@ -13,6 +13,7 @@ import pytest
 import trimesh
 
 from kmn_jax.data import Pack, PackConfig, Record, Source, build_pack
+from kmn_jax.data._build import _Journal
 from kmn_jax.errors import InputError
 
 CONFIG = PackConfig(surfels=128, bin_surfels=64, drops=2, copies=(1, 2))
@@ -153,9 +154,14 @@ def test_refuses_what_cannot_be_built_before_it_starts(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="file/pack cannot be written to"):
         build_pack(tmp_path / "file" / "pack", sources, CONFIG)
     (tmp_path / "pack").mkdir()
-    (tmp_path / "pack" / "journal.jsonl").write_bytes(b"nonsense\n")
-    with pytest.raises(InputError, match=r"journal\.jsonl is damaged"):
-        build_pack(tmp_path / "pack", sources, CONFIG)
+    journal = tmp_path / "pack" / "journal.jsonl"
+    _Journal(journal, CONFIG)
+    begin = journal.read_bytes()
+    other = b'{"name": ["a"], "split": "train", "seconds": 1, "reason": "b", "entry": null}'
+    for content in (b"nonsense", *(begin + row for row in (b"3", b"{}", b'{"entry": 3}', b'{"entry": null}', other))):
+        journal.write_bytes(content + b"\n")
+        with pytest.raises(InputError, match=r"journal\.jsonl is damaged"):
+            build_pack(tmp_path / "pack", sources, CONFIG)
 
 
 @pytest.mark.parametrize(

@@ -202,6 +202,16 @@ def test_refuses_a_manifest_that_is_not_json(pack: Pack, content: bytes) -> None
         Pack(pack.folder)
 
 
+def test_refuses_a_view_or_bin_without_a_size(tmp_path: Path) -> None:
+    item = packed_object()
+    scene = item.drops[0].scene
+    huge = replace(scene, camera=replace(scene.camera, width=10**60))  # infinite as float32
+    with np.errstate(over="ignore"):
+        pack = write_pack(tmp_path, replace(item, drops=(replace(item.drops[0], scene=huge),)))
+    with pytest.raises(InputError, match="is not an object of a pack"):
+        pack.load(item.name)
+
+
 def test_refuses_a_folder_without_a_manifest(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="name the folder of a pack"):
         Pack(tmp_path)

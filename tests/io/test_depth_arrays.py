@@ -99,6 +99,8 @@ def test_a_pose_is_read_in_all_forms(content: Any, unit: str | None, tmp_path: P
         ("{", "cannot be used as a pose"),
         ("{}", r"has no T_base_camera \(4 x 4 numbers\), and no xyz with xyzw"),
         ('"a"', "no matrix of 4 x 4 numbers"),
+        (json.dumps([[10**400] * 4] * 4), "no matrix of 4 x 4 numbers"),
+        ('{"xyz": [1, 2, 1' + "0" * 400 + '], "xyzw": [0, 0, 0, 1]}', "xyz must be 3 finite numbers"),
         (json.dumps((2 * POSE).tolist()), "is not a rigid pose"),
         (json.dumps(POSE[:3].tolist()), r"has shape \(3, 4\)"),
         ('{"xyz": [1, 2, 3], "xyzw": [0, 0, 0, 2]}', "xyzw has the length 2, but must be a unit quaternion"),

@@ -19,6 +19,7 @@ from kmn_jax.io._scans import read_camera
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform(1, 2, (50, 3)).astype(np.float32)
 NORMALS = (POINTS / np.linalg.norm(POINTS, axis=1, keepdims=True)).astype(np.float32)
+PCD = b"VERSION 0.7\nFIELDS x y z\nSIZE " + b"9" * 3000 + b" 4 4\nTYPE F F F\nPOINTS 1\nDATA binary\n"
 CAMERA = {"fx": 100.0, "fy": 110.0, "cx": 3.5, "cy": 2.5}
 
 
@@ -115,6 +116,7 @@ def test_intrinsics_may_be_in_the_file_or_a_matrix(tmp_path: Path) -> None:
         ("scan.xyz", b"0 0 0\nnan nan nan\n", "none of its 2 points was measured"),
         ("scan.ply", b"solid", "cannot be used"),
         ("scan.npy", b"\x93NUMPY", "not a readable .npy file"),
+        pytest.param("scan.pcd", PCD, r"data type '<f9{99,111}\.\.\.\)$", id="long word"),
         ("scan.npz", b"PK", "not a readable .npz file"),
         ("scan.png", b"\x89PNG", "not a readable image"),
         ("scan.png", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", "not a readable image"),
@@ -140,6 +142,10 @@ def test_wrong_arrays_are_refused(tmp_path: Path) -> None:
     refused(np.zeros((4, 5, 2)), "its points have shape")
     refused(np.zeros((4, 5)), "none of its 4 x 5 pixels was measured")
     refused(np.zeros((0, 3)), "none of its 0 points was measured")
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": (2**70, 0, 3)})
+    with pytest.raises(InputError, match="it is damaged, its shape is"):
+        read_scan(path, "mm")
     refused(np.array([{}], dtype=object), "does not hold numbers, but object values")
     np.savez(tmp_path / "scan.npz", other=np.zeros(3))
     with pytest.raises(InputError, match="it holds other, but neither points nor depth"):
@@ -170,6 +176,7 @@ def test_pictures_and_missing_cameras_are_refused(tmp_path: Path) -> None:
         ('{"cam_K": [9, 0, 0, 0, 9, 0, 4, 3, 1]}', "row by row"),
         ('{"fx": 1, "fy": 1, "cx": 1, "cy": 1, "depth_scale": 1e999}', "all finite"),
         ('{"fx": "a", "fy": 1, "cx": 1, "cy": 1}', "cannot be used as a camera"),
+        pytest.param(json.dumps({"cam_K": ["a" * 5000] * 9}), r"a\.\.\.$", id="long"),
     ],
 )
 def test_broken_cameras_are_refused(tmp_path: Path, content: str, message: str) -> None:
@@ -177,6 +184,7 @@ def test_broken_cameras_are_refused(tmp_path: Path, content: str, message: str) 
     with pytest.raises(InputError, match=message) as caught:
         read_camera(tmp_path / "camera.json")
     assert str(caught.value).startswith(f"{tmp_path / 'camera.json'} cannot be used")
+    assert len(str(caught.value)) < len(str(tmp_path)) + 300
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32, np.float16, np.uint16, np.int32])

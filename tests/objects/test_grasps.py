@@ -63,6 +63,8 @@ def test_grasps_and_gripper_in_any_unit(tmp_path: Path) -> None:
         ({"grasps": [{"width": 3}]}, r"grasp 1: it has no T_object_grasp \(4 x 4 numbers\), and no xyz with xyzw"),
         ({"grasps": [{"T_object_grasp": np.zeros((4, 4)).tolist()}]}, "grasp 1: T_object_grasp is not a rigid pose"),
         ({"grasps": [{**FILE["grasps"][0], "width": "4"}]}, "width of grasp 1 must be a number of zero or more"),
+        ({"grasps": [{**FILE["grasps"][0], "width": 10**400}]}, "width of grasp 1 must be a number of zero or more"),
+        ({"gripper": {"boxes": [{"center": [10**400, 0, 0], "size": [1, 1, 1]}]}}, "the center of a box must be three"),
     ],
 )
 def test_what_is_no_file_of_grasps_is_one_sentence(changes: Any, message: str, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -83,6 +84,7 @@ def test_a_card_of_other_weights_is_refused_with_what_renews_it(part: Part, tmp_
         ("points", np.zeros((5, 2), np.float32)),
         ("normals", np.zeros((3, 3), np.float32)),
         ("normals", np.zeros((256, 3), np.float32)),
+        ("normals", np.full((256, 3), 3e38, np.float32)),
         ("features", np.full((8, 8), np.nan, np.float32)),
         ("symmetry_rotations", np.zeros((0, 3, 3))),
         ("minimum", None),
@@ -111,6 +113,11 @@ def test_what_is_no_card_is_refused(part: Part, tmp_path: Path) -> None:
     path.write_bytes(b"solid shaft")
     with pytest.raises(InputError, match="not a readable safetensors file"):
         load_part(path)
+    header = json.dumps({"a" * 5000: "b" * 5000}).encode()
+    path.write_bytes(len(header).to_bytes(8, "little") + header)
+    with pytest.raises(InputError, match="not a readable safetensors file") as caught:
+        load_part(path)
+    assert len(str(caught.value)) < len(str(path)) + 200
     save_file({"points": part.points}, path)
     with pytest.raises(InputError, match="is no object card of this version"):
         load_part(path)

@@ -79,16 +79,17 @@ def test_a_run_writes_config_versions_metrics_and_models(whole: tuple[Path, Outc
     assert load_model(folder / "model.safetensors").config == tiny().network
 
 
-def test_resume_after_a_signal_is_bitwise(whole: tuple[Path, Outcome], tmp_path: Path) -> None:
-    folder, handler = tmp_path / "run", signal.getsignal(signal.SIGTERM)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_resume_after_a_signal_is_bitwise(whole: tuple[Path, Outcome], tmp_path: Path, number: signal.Signals) -> None:
+    folder, handler = tmp_path / "run", signal.getsignal(number)
 
     def stop_at_validation(message: str) -> None:
         if message.startswith("step 3"):
-            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), number)
 
     stopped = train(tiny(), folder, progress=False, report=stop_at_validation)
-    assert (stopped.step, stopped.reason) == (3, "SIGTERM came")
-    assert signal.getsignal(signal.SIGTERM) == handler
+    assert (stopped.step, stopped.reason) == (3, f"{number.name} came")
+    assert signal.getsignal(number) == handler
     assert json.loads(newest(folder / "checkpoints").batches)["next_batch"] == 3
     # What a process that was killed later on would have left.
     later = {"step": 4, "split": "train", "loss": 99.0}
