@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import logging
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -182,7 +180,7 @@ def _save(path: Path, packed: Packed) -> None:
     staging = path.with_name(f".{path.name}")
     staging.mkdir()
     arrays = {name: array for name, array in packed.arrays.items() if array.size}  # orbax refuses empty ones
-    with _silent(), _checkpointer() as checkpointer:
+    with _checkpointer() as checkpointer:
         checkpointer.save(staging / _STATE, args=ocp.args.PyTreeSave(arrays))
     files = {str(file.relative_to(staging)): _sha256(file) for file in sorted(staging.rglob("*")) if file.is_file()}
     content = json.dumps({"record": packed.record, "files": files})
@@ -223,18 +221,6 @@ def _checkpointer() -> Any:
     )
     handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=alone)
     return ocp.Checkpointer(handler, multiprocessing_options=alone)
-
-
-@contextlib.contextmanager
-def _silent() -> Iterator[None]:
-    """Keep orbax from logging tracebacks of what it raises, too."""
-    logger = logging.getLogger("absl")
-    before = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logger.setLevel(before)
 
 
 def _sha256(path: Path) -> str:
