@@ -71,6 +71,10 @@ def test_a_full_disk_and_a_signal_lose_nothing(whole: tuple[Path, Outcome], smal
     assert_same_runs(folder, whole[0])
 
 
+# Threads of orbax, too, meet the full disk, and say so after the loop that they belong to has ended.
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::pytest.PytestUnhandledThreadExceptionWarning"
+)
 def test_a_checkpoint_that_does_not_fit_is_told_and_the_one_before_kept(small_disk: Path) -> None:
     checkpoints, free = Checkpoints(small_disk / "run"), shutil.disk_usage(small_disk).free
     checkpoints.save(random_snapshot(1))
