@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import logging
 import math
 import signal
 import tempfile
@@ -83,12 +84,16 @@ def uvicorn_config(app: Any, config: ServeConfig) -> Any:
 
     from kmn_jax.serve._connections import BoundedConnection
 
+    log = logging.getLogger("uvicorn")
+    log.propagate = False
+    if logging.lastResort is not None:
+        log.addHandler(logging.lastResort)  # what stderr is at the time
     return uvicorn.Config(
         app,
         http=functools.partial(BoundedConnection, config),  # type: ignore[arg-type]
         ws="none",
         loop="asyncio",
-        log_config=None,  # which would end the handlers that the process has
+        log_config=None,  # uvicorn's own would end all handlers that the process has
         log_level="error",  # what clients do wrong is no news
         access_log=False,
         proxy_headers=False,
