@@ -109,7 +109,9 @@ def test_seeds_are_no_more_than_asked_for_or_needed(scene: Scene) -> None:
     assert len(seeds_over(scene, one_point, PART)) == 1
 
 
-@pytest.mark.parametrize("values", [{"most_seeds": 0}, {"later_seeds": 0}, {"reported": 0.6}, {"patience": 0}])
+@pytest.mark.parametrize(
+    "values", [{"most_seeds": 0}, {"later_seeds": 0}, {"reported": 0.8}, {"likely": 1.5}, {"patience": 0}]
+)
 def test_contradictory_values_are_refused(values: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(values))):
         DetectConfig(**values)  # type: ignore[arg-type]

@@ -180,18 +180,20 @@ def undecodable(path: Path) -> None:
     content = json.loads(json.loads((path / "record.json").read_text())["content"])
     content["files"][str(broken.relative_to(path))] = hashlib.sha256(broken.read_bytes()).hexdigest()
     text = json.dumps(content)
-    stored = {"sha256": hashlib.sha256(text.encode()).hexdigest(), "content": text}
-    (path / "record.json").write_text(json.dumps(stored))
+    (path / "record.json").write_text(
+        json.dumps({"sha256": hashlib.sha256(text.encode()).hexdigest(), "content": text})
+    )
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # of threads of orbax, with their loop
 def test_what_orbax_cannot_decode_gives_way_to_the_one_before(two: Path, tmp_path: Path, like: TrainState) -> None:
     folder = shutil.copytree(two, tmp_path / "checkpoints")
     undecodable(folder / "step-00000020")
     reports: list[str] = []
     checkpoints = Checkpoints(folder, report=reports.append)
     assert_same(checkpoints.latest(like), random_snapshot(10, like))
-    assert len(reports) == 1
-    assert "step-00000020 cannot be decoded and is not used: " in reports[0]
+    (said,) = reports
+    assert "step-00000020 cannot be decoded and is not used: " in said
     checkpoints.save(random_snapshot(15, like))
     assert checkpoints.steps == [10, 15]
 
