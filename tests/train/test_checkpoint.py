@@ -180,9 +180,8 @@ def undecodable(path: Path) -> None:
     content = json.loads(json.loads((path / "record.json").read_text())["content"])
     content["files"][str(broken.relative_to(path))] = hashlib.sha256(broken.read_bytes()).hexdigest()
     text = json.dumps(content)
-    (path / "record.json").write_text(
-        json.dumps({"sha256": hashlib.sha256(text.encode()).hexdigest(), "content": text})
-    )
+    stored = {"sha256": hashlib.sha256(text.encode()).hexdigest(), "content": text}
+    (path / "record.json").write_text(json.dumps(stored))
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # of threads of orbax, with their loop
@@ -192,8 +191,7 @@ def test_what_orbax_cannot_decode_gives_way_to_the_one_before(two: Path, tmp_pat
     reports: list[str] = []
     checkpoints = Checkpoints(folder, report=reports.append)
     assert_same(checkpoints.latest(like), random_snapshot(10, like))
-    (said,) = reports
-    assert "step-00000020 cannot be decoded and is not used: " in said
+    assert ["step-00000020 cannot be decoded and is not used: " in text for text in reports] == [True]
     checkpoints.save(random_snapshot(15, like))
     assert checkpoints.steps == [10, 15]
 
