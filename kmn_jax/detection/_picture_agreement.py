@@ -212,7 +212,7 @@ def _outline(seen: _Predicted, found: _Measured, compared: Bool[Array, "s s"], d
     # Of cells without depth, the farthest of those around, twice.
     depth = jnp.where(seen.mask, seen.depth, -jnp.inf)
     for _ in range(2):
-        depth = jnp.where(jnp.isfinite(depth), depth, _most(depth, -jnp.inf))
+        depth = jnp.where(jnp.isfinite(depth), depth, _most(depth))
     gap = jnp.where(outline & found.there, found.depth - depth, 0) / diameter
     there = outline & found.there
     fronted = there & (gap < -_LEVEL)
@@ -263,8 +263,8 @@ def _grown(mask: Bool[Array, "s s"]) -> Bool[Array, "s s"]:
     return _along_both(mask, 1, False, lambda shifted: shifted.any(axis=0))
 
 
-def _most(values: Float[Array, "s s"], fill: float) -> Float[Array, "s s"]:
-    return _along_both(values, 1, fill, lambda shifted: shifted.max(axis=0))
+def _most(values: Float[Array, "s s"]) -> Float[Array, "s s"]:
+    return _along_both(values, 1, -jnp.inf, lambda shifted: shifted.max(axis=0))
 
 
 def _summed(values: Float[Array, "s s c"], reach: int) -> Float[Array, "s s c"]:
@@ -273,4 +273,4 @@ def _summed(values: Float[Array, "s s c"], reach: int) -> Float[Array, "s s c"]:
 
 def _steps(depth: Float[Array, "s s"], of: Bool[Array, "s s"]) -> Float[Array, "s s"]:
     """Return the difference of the farthest and the nearest depth around each cell; not finite where there is none."""
-    return _most(jnp.where(of, depth, -jnp.inf), -jnp.inf) + _most(jnp.where(of, -depth, -jnp.inf), -jnp.inf)
+    return _most(jnp.where(of, depth, -jnp.inf)) + _most(jnp.where(of, -depth, -jnp.inf))
