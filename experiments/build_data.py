@@ -4,6 +4,8 @@ electronics  the training pack: 1,507 components of KiCad's public library, as `
              20 bins each, of 1 to 20 copies. The models come from `--models`, a folder that holds them as KiCad lays
              them out, or on Debian and its like from the package kicad-packages3d, which is downloaded (380 MB) but
              not installed.
+surfels      the surfels of these components and of parts made by parameters (`experiments/training_parts.py`), without
+             bins: the training pack of worlds that are made inside of the step.
 test-sets    7 electronic and 7 industrial objects in 20 bins each, rendered by ray casting, as BOP datasets; their
              digests are compared with those in `assets/test_sets.json`.
 validation-bins  the 50 validation components in 6 bins each, rendered by ray casting, one half as a perfect sensor sees
@@ -19,16 +21,19 @@ A build goes on where it stopped, however it stopped; objects that cannot be use
 
 from __future__ import annotations
 
+import random
 import sys
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import tyro
 from jaxtyping import Float
 
 from experiments.kicad import catalogue_sources
+from experiments.parametric_parts import write_parts
 from experiments.test_sets import (
     ASSETS,
     CONFIG,
@@ -41,6 +46,7 @@ from experiments.test_sets import (
     validation_sources,
     verdict,
 )
+from experiments.training_parts import TRAINING_FAMILIES
 from experiments.worlds import TEST, VALIDATION, build_worlds
 from kmn_jax.data import Pack, PackConfig, PackedObject, Record, Source, build_pack
 from kmn_jax.errors import InputError
@@ -55,6 +61,7 @@ SMALL_PACK = (
     "Diode_THT.3dshapes/D_DO-15_P5.08mm_Vertical_KathodeUp",
     "Package_TO_SOT_SMD.3dshapes/TSOT-23",
 )
+_PARTS_SEED = 13  # world bins have others
 SMALL_TEST_SET = ("Connector_USB.3dshapes/USB_A_TE_292303-7_Horizontal", "gear_motor")
 
 
@@ -79,6 +86,28 @@ class Electronics:
             retry_rejected=self.retry_rejected,
             licence=licence,
         )
+        print_summary(self.folder, records)
+
+
+@dataclass(frozen=True)
+class AllSurfels:
+    """Build the pack of surfels of electronic components and of parts made by parameters."""
+
+    folder: Path = OUTPUTS / "packs" / "surfels"
+    models: Path | None = None  # as for electronics
+    limit: int | None = None  # of the components, build only so many
+    parts: int = 40  # of each family
+    workers: int | None = None
+
+    def run(self) -> None:
+        sources, licence = catalogue_sources(self.models, OUTPUTS / "kicad", self.limit)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=self.folder) as made:
+            paths = write_parts(Path(made), tuple(TRAINING_FAMILIES), self.parts, _PARTS_SEED)
+            sources += [Source(path.stem, "train", path) for path in paths]
+            random.Random(_PARTS_SEED).shuffle(sources)
+            config = PackConfig(drops=0)
+            records = build_pack(self.folder, sources, config, workers=self.workers, licence=licence)
         print_summary(self.folder, records)
 
 
@@ -264,6 +293,7 @@ def main() -> None:
         tyro.extras.subcommand_cli_from_dict(
             {
                 "electronics": Electronics,
+                "surfels": AllSurfels,
                 "test-sets": TestSets,
                 "validation-bins": ValidationBins,
                 "worlds": Worlds,

@@ -244,3 +244,20 @@ def test_show_data_names_what_is_missing(tmp_path: Path) -> None:
     assert result.returncode == 1
     assert result.stderr.startswith("error: ")
     assert "manifest.json cannot be read" in result.stderr
+
+
+def test_surfels_are_of_components_and_of_parts_made_by_parameters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    component = build_data.Source(
+        "component", "validation", ROOT / "experiments" / "assets" / "industrial" / "screw.stl"
+    )
+    monkeypatch.setattr(build_data, "catalogue_sources", lambda *given: ([component], "a licence"))
+    monkeypatch.setattr(build_data, "TRAINING_FAMILIES", ["clip", "cup"])
+    build_data.AllSurfels(tmp_path, parts=1, workers=1).run()
+    pack = Pack(tmp_path)
+    assert set(pack.names("train")) == {"clip_0", "cup_0"}
+    assert pack.names("validation") == ["component"]
+    assert not pack.problems()
+    assert not pack.load("clip_0").drops
+    assert not list(tmp_path.glob("tmp*"))
