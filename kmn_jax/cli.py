@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shlex
 import sys
@@ -280,7 +279,7 @@ class _Session:
     """An estimator with the part and the scan of a request."""
 
     def __init__(self, request: Request) -> None:
-        from kmn_jax.detection import THOROUGH, Clock, ForegroundOptions, OrientedBox, PoseEstimator
+        from kmn_jax.detection import THOROUGH, Clock, ForegroundOptions, OrientedBox, PoseEstimator, prepare_kept
         from kmn_jax.io import read_pose
         from kmn_jax.objects import load_grasps
 
@@ -297,7 +296,7 @@ class _Session:
         self._request, self._clock = request, Clock()
         with self._clock("part"):
             self.estimator = PoseEstimator.from_pretrained(request.weights, THOROUGH if request.thorough else None)
-            self.part = self.estimator.prepare(request.object, _unit(request.object_units))
+            self.part = prepare_kept(self.estimator, request.object, _unit(request.object_units))
         with self._clock("scene"):
             empty = None
             if request.background is not None:
@@ -338,22 +337,6 @@ def _unit(units: Units) -> Unit | None:
     return None if units == "auto" else units
 
 
-def _keep_compiled() -> None:
-    """Let JAX keep compiled programs between calls, in the user's cache unless told another place.
-
-    Without a home, or with one that cannot be written to, nothing is kept.
-    """
-    import jax
-
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        with contextlib.suppress(OSError, RuntimeError):
-            folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "kmn_jax"
-            folder.mkdir(parents=True, exist_ok=True)
-            if os.access(folder, os.W_OK):
-                jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line: 0 is success, 2 bad input (one sentence on stderr), 1 our own failure."""
     arguments = joined(sys.argv[1:] if arguments is None else arguments)
@@ -363,9 +346,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         run = parsed(arguments, (prepare, detect, view, serve, export, convert))
         from kmn_jax.geometry import ask_for_fast_selection
+        from kmn_jax.programs import keep_compiled
 
         ask_for_fast_selection()
-        _keep_compiled()
+        keep_compiled()
         run()
         sys.stdout.flush()
     except BrokenPipeError:  # nobody reads on, as in `kmn detect ... | head -1`

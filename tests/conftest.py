@@ -33,6 +33,14 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
+@pytest.fixture(autouse=True, scope="session")
+def trace_what_is_tested() -> Iterator[None]:
+    """Let commands that are called by tests keep no traced programs: they are those of the code as it is."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("kmn_jax.programs.keep_programs", lambda folder: None)
+        yield
+
+
 @pytest.fixture(autouse=True, scope="module")
 def forget_what_was_compiled() -> Iterator[None]:
     """Forget compiled programs before they take all the memory maps that Linux allows a process (65,530)."""

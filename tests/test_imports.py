@@ -28,9 +28,9 @@ ROOMS = (
     "serve",
     "cli",
 )
-RANKS = dict.fromkeys(("typing", "errors", "units", "extras", "files", "limits", "report", "web", "arguments"), 0) | {
-    name: rank for rank, name in enumerate(ROOMS, start=1)
-}
+RANKS = dict.fromkeys(
+    ("typing", "errors", "units", "extras", "files", "limits", "programs", "report", "web", "arguments"), 0
+) | {name: rank for rank, name in enumerate(ROOMS, start=1)}
 # Pairs of neighbours that the ranks alone would allow: the pose solver takes arrays, not models.
 FORBIDDEN = {("kmn_jax.pose", "kmn_jax.models"), ("benchmarks", "experiments"), ("experiments", "benchmarks")}
 OUTER_RANKS = {"configs": 20, "experiments": 21, "benchmarks": 21, "tests": 22}

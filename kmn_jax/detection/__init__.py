@@ -45,6 +45,7 @@ from kmn_jax.detection._export import export_estimator
 from kmn_jax.detection._foreground import ForegroundOptions, OrientedBox, foreground
 from kmn_jax.detection._frames import into, placed
 from kmn_jax.detection._grasps import Conflict, Copy, grasp_conflict, with_grasps
+from kmn_jax.detection._kept_parts import prepare_kept
 from kmn_jax.detection._mapping import call_rows, map_real, map_rows
 from kmn_jax.detection._output import as_json, describe, table, write_bop_csv, write_json
 from kmn_jax.detection._picture_agreement import PictureAgreement, picture_agreement
@@ -147,6 +148,7 @@ __all__ = [
     "poses_in_crop",
     "poses_of_draw",
     "predict",
+    "prepare_kept",
     "probabilities_bytes",
     "refined",
     "refined_candidates",

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -43,6 +42,7 @@ from kmn_jax.pose import (
     ransac_modes,
     surface_agreement,
 )
+from kmn_jax.programs import kept
 from kmn_jax.typing import PRNGKey, Scalar
 
 _NORMAL_RADIUS = 0.06  # diameters, of normals without smoothing
@@ -386,5 +386,5 @@ def _flat(leaf: Shaped[Array, "d n ..."]) -> Shaped[Array, "m ..."]:
     return leaf.reshape(-1, *leaf.shape[2:])
 
 
-crop_of_scene = partial(jax.jit, static_argnames="config")(search_crop)
-find_poses_in_crop = partial(jax.jit, static_argnames=("graphdef", "config"))(poses_in_crop)
+crop_of_scene = kept("config", results=(Crop,))(search_crop)
+find_poses_in_crop = kept("graphdef", "config", results=(CropPoses, PoseResult, Prediction))(poses_in_crop)

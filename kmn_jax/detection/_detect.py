@@ -211,7 +211,8 @@ def chosen(found: Candidates, calibration: Calibration, part: DevicePart, config
     rows = np.pad(ranked, (0, _CONSIDERED - len(ranked)), mode="edge")
     usable = possible[rows] & (np.arange(_CONSIDERED) < len(ranked))
     poses = found.T_camera_object[rows]
-    few: Selection = jax.device_get(select_poses(poses, probability[rows].astype(np.float32), usable, part))
+    given = jax.device_put((poses, probability[rows].astype(np.float32), usable))
+    few: Selection = jax.device_get(select_poses(given[0], given[1], given[2], part))
 
     def of_all(values: Any) -> Any:
         result = np.zeros(len(possible), dtype=values.dtype)

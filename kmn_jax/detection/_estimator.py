@@ -44,6 +44,7 @@ from kmn_jax.objects import (
     make_part,
     model_digest,
 )
+from kmn_jax.programs import read_kept
 from kmn_jax.typing import ArrayInput
 from kmn_jax.units import Unit
 
@@ -71,6 +72,7 @@ class PoseEstimator:
         Probabilities are those of the calibration beside the file (NAME.calibration.json); without one, those of the
         released network `small`, and each result says so. Raises InputError if there is no such network.
         """
+        read_kept()
         path = Path(weights) if Path(weights).suffix == ".safetensors" else released_file(str(weights))
         model = load_model(path)
         fitted = path.with_suffix(".calibration.json")

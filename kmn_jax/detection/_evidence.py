@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -15,6 +13,7 @@ from kmn_jax.detection._picture_agreement import PictureAgreement, picture_agree
 from kmn_jax.geometry import inverse, nearest, transform_points
 from kmn_jax.objects import PartArrays
 from kmn_jax.pose import PoseResult
+from kmn_jax.programs import kept
 from kmn_jax.simulate import Surfels
 from kmn_jax.typing import Scalar
 
@@ -95,4 +94,4 @@ def _mean(values: Array, where: Bool[Array, " n"]) -> Scalar:
     return chosen.sum() / jnp.maximum(where.sum(dtype=jnp.int32), 1).astype(jnp.float32)
 
 
-gather_evidence = partial(jax.jit, static_argnames="config")(evidence_on)
+gather_evidence = kept("config")(evidence_on)

@@ -49,6 +49,6 @@ def call_rows(one: Callable[..., _Result], many: Callable[..., _Result], *items:
         return cast(_Result, jax.tree.map(lambda leaf: leaf[:count], found))
     rows = [jax.tree.map(lambda leaf, row=row: leaf[row], items) for row in range(count)]
     with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(lambda item: jax.device_get(one(*jax.tree.map(jnp.asarray, item))), rows))
+        found = list(pool.map(lambda item: jax.device_get(one(*jax.device_put(item))), rows))
     stacked: _Result = jax.tree.map(lambda *leaves: np.stack(leaves), *found)
     return stacked

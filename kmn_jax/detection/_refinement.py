@@ -34,6 +34,7 @@ from kmn_jax.geometry import (
     with_normals,
 )
 from kmn_jax.pose import IcpConfig, icp
+from kmn_jax.programs import kept
 from kmn_jax.simulate import SplatConfig, Surfels, visible_by_splatting
 from kmn_jax.typing import Pose, PRNGKey, Scalar
 
@@ -157,5 +158,5 @@ def refine_many(
     return jax.vmap(one)(poses, rows, jax.random.wrap_key_data(keys))
 
 
-_crop = partial(jax.jit, static_argnames=("num_points", "min_points"))(crop_around)
-_forms = partial(jax.jit, static_argnames=("smooth", "agreement", "margin"))(refined_forms)
+_crop = kept("num_points", "min_points", results=(Crop,))(crop_around)
+_forms = kept("smooth", "agreement", "margin")(refined_forms)

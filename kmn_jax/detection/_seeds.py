@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -12,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from kmn_jax.detection._scene import Scene, nearest_row
 from kmn_jax.geometry import PaddedCloud, farthest_point_indices
 from kmn_jax.objects import Part
+from kmn_jax.programs import kept
 
 NUM_SEEDS = 32  # that are spread in one call: one number, so one compilation
 SPACING = 0.4  # diameters: seeds are at most about so far apart, as far as there are enough
@@ -52,4 +50,4 @@ def spread_seeds(
     return rows, ~same & usable[anchor]
 
 
-_spread = partial(jax.jit, static_argnames="count")(spread_seeds)
+_spread = kept("count")(spread_seeds)

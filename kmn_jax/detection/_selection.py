@@ -13,6 +13,7 @@ from kmn_jax.detection._device_part import DevicePart
 from kmn_jax.detection._mapping import map_real
 from kmn_jax.geometry import compose, inverse, squared_distances, transform_points
 from kmn_jax.pose import mssd
+from kmn_jax.programs import kept
 from kmn_jax.typing import Normals, Points, Pose, Scalar
 
 DEPTH = 0.05  # diameters: a point so far below another part's surface is inside of it
@@ -126,4 +127,4 @@ def share_inside(
     return ((height < -depth) | on).mean()
 
 
-select_poses = jax.jit(select)
+select_poses = kept("contest", results=(Selection,))(select)

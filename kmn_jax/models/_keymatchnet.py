@@ -28,6 +28,7 @@ from kmn_jax.models._invariants import (
 from kmn_jax.models._layers import NormalizedLinear, dropout
 from kmn_jax.models._normalization import metric_object, metric_scene, released_object, released_scene
 from kmn_jax.models._pair_head import PairHead
+from kmn_jax.programs import kept
 from kmn_jax.typing import ArrayInput
 
 _LARGEST = 1e18  # a length whose square, summed over three axes, still fits float32
@@ -265,7 +266,7 @@ def _check_extent(extent: Float[Array, ""], name: str) -> None:
         raise InputError(f"{name} is too large for float32: use a larger unit of length")
 
 
-@partial(jax.jit, static_argnums=0)
+@kept("graphdef", results=(ObjectFeatures,))
 def _encode_object(
     graphdef: nnx.GraphDef,
     parameters: nnx.State,

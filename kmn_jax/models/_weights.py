@@ -6,7 +6,7 @@ import dataclasses
 import json
 from pathlib import Path
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from flax import nnx
 from safetensors import SafetensorError, safe_open
@@ -88,5 +88,5 @@ def load_model(path: str | Path) -> Model:
         raise InputError(f"{path} does not fit its own config: {'; '.join(problems[:8])}")
     return Model(
         graphdef,
-        nnx.from_flat_state({t: flat[t].replace(jnp.asarray(tensors[name])) for name, t in wanted.items()}),
+        nnx.from_flat_state({t: flat[t].replace(jax.device_put(tensors[name])) for name, t in wanted.items()}),
     )

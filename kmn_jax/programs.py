@@ -1,0 +1,204 @@
+"""Programs that are kept for the next process: compiled, and, before that, traced.
+
+JAX's cache keeps what XLA makes of a program. To find it there, a process must trace the program first, which takes
+several times as long as reading what was found. Programs that are marked as `kept` are exported as well, into a folder
+beside that cache; another process reads them in the background, while it reads its input. Where nothing
+asked for a folder, as in a library or in tests, a kept program is what `jax.jit` returns.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import inspect
+import os
+import shutil
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import update_wrapper
+from pathlib import Path
+from threading import Lock
+from typing import Any, Generic, ParamSpec, TypeVar, cast
+
+import jax
+import jaxlib
+import numpy as np
+from jax import export
+
+from kmn_jax.files import write_whole
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+_MOST = 24  # programs of a folder that are kept
+_FOLDERS = 2  # of programs: of this version of the package, and of the one that was used before
+_DIGEST = 32  # bytes
+_store: _Store | None = None
+
+
+def keep_compiled() -> None:
+    """Keep programs between processes, in the user's cache, or where JAX_COMPILATION_CACHE_DIR says.
+
+    Without a home, or with one that cannot be written to, nothing is kept.
+    """
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        with contextlib.suppress(OSError, RuntimeError):
+            folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "kmn_jax"
+            folder.mkdir(parents=True, exist_ok=True)
+            if os.access(folder, os.W_OK):
+                jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    chosen = jax.config.values["jax_compilation_cache_dir"]
+    if chosen:
+        keep_programs(Path(chosen) / "programs")
+
+
+def keep_programs(folder: Path | None) -> None:
+    """Keep programs in a folder, and read those that are there; None: keep none from now on."""
+    global _store
+    _store = None
+    if folder is not None:
+        with contextlib.suppress(OSError):
+            _store = _Store(folder)
+
+
+def kept_folder() -> Path | None:
+    """Return the folder in which this version of the package keeps things, if it does."""
+    return None if _store is None else _store.folder
+
+
+def read_kept() -> None:
+    """Begin to read what is kept, if anything is; call it once the modules are imported whose programs these are."""
+    if _store is not None:
+        _store.begin()
+
+
+def kept(
+    *static: str, results: tuple[type, ...] = ()
+) -> Callable[[Callable[_Arguments, _Result]], KeptProgram[_Arguments, _Result]]:
+    """Return what compiles a function as `jax.jit` does, and keeps it.
+
+    Args:
+        static: names of arguments that are no arrays; their `repr` must say all about them.
+        results: the named tuples among what the function returns.
+    """
+    return lambda function: KeptProgram(function, static, results)
+
+
+class KeptProgram(Generic[_Arguments, _Result]):
+    """A compiled function; see `kept`."""
+
+    def __init__(self, function: Callable[_Arguments, _Result], static: tuple[str, ...], results: tuple[type, ...]):
+        update_wrapper(self, function)
+        self.compiled = jax.jit(function, static_argnames=static)
+        self.function, self.static = function, static
+        self.signature = inspect.signature(function)
+        for result in results:
+            with contextlib.suppress(ValueError):  # another program returns it, too
+                export.register_namedtuple_serialization(result, serialized_name=f"kmn_jax.{result.__name__}")
+
+    def __call__(self, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        """Call it; inside of a trace, and where nothing is kept, as `jax.jit` would."""
+        if _store is None:
+            return self.compiled(*args, **kwargs)
+        bound = self.signature.bind(*args, **kwargs)
+        bound.apply_defaults()
+        fixed = {name: bound.arguments.pop(name) for name in self.static}
+        leaves, tree = jax.tree.flatten(bound.arguments)
+        if not all(map(_is_array, leaves)):
+            return self.compiled(*args, **kwargs)
+        shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+        program = _store.program(self, fixed, tree, shapes, leaves)
+        return cast(_Result, program(*leaves)) if program else self.compiled(*args, **kwargs)
+
+
+def _is_array(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array | np.ndarray | np.generic) and not isinstance(leaf, jax.core.Tracer)
+
+
+class _Store:
+    """A folder of exported programs, and those of them that this process has compiled."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / _version()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        os.utime(self.folder)
+        _forget_old(folder)
+        self.programs: dict[Any, Any] = {}
+        self.lock = Lock()
+        self.read: dict[str, Future[Any]] = {}
+
+    def begin(self) -> None:
+        """Begin to read all programs, the longest ones first, unless that was done."""
+        if self.read:
+            return
+        files = sorted(self.folder.glob("*.export"), key=lambda path: -path.stat().st_size)
+        pool = ThreadPoolExecutor(2, thread_name_prefix="programs")
+        self.read = {path.name: pool.submit(_read, path) for path in files[:_MOST]}
+        pool.shutdown(wait=False)
+
+    def program(
+        self, of: KeptProgram[Any, Any], fixed: dict[str, Any], tree: Any, shapes: Any, leaves: list[Any]
+    ) -> Callable[..., Any] | None:
+        """Return the program for arguments like these; None if it cannot be exported."""
+        key = (of.function, *fixed.values(), tree, shapes)
+        found = self.programs.get(key, self)
+        if found is not self:
+            return cast("Callable[..., Any] | None", found)
+        with self.lock:  # of two threads that ask for the same program, one makes it
+            if key not in self.programs:
+                text = "\n".join(map(repr, (*fixed.items(), tree, shapes)))
+                name = f"{of.function.__name__}-{hashlib.sha256(text.encode()).hexdigest()[:32]}.export"
+                read = self.read.get(name)
+                self.programs[key] = (read and read.result()) or self._make(name, of, fixed, tree, leaves)
+            return cast("Callable[..., Any] | None", self.programs[key])
+
+    def _make(
+        self, name: str, of: KeptProgram[Any, Any], fixed: dict[str, Any], tree: Any, leaves: list[Any]
+    ) -> Callable[..., Any] | None:
+        def flat(*leaves: Any) -> Any:
+            return of.function(**jax.tree.unflatten(tree, leaves), **fixed)
+
+        try:
+            exported = export.export(jax.jit(flat))(*leaves)
+            content = bytes(exported.serialize())
+        except (NotImplementedError, ValueError):  # what JAX says of programs that cannot be exported
+            return None
+        if len(list(self.folder.glob("*.export"))) < _MOST:
+            with contextlib.suppress(OSError):
+                write_whole(self.folder / name, hashlib.sha256(content).digest() + content)
+        return _compiled(exported)
+
+
+def _read(path: Path) -> Callable[..., Any] | None:
+    """Return the program in a file, compiled; None if it is damaged."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    if hashlib.sha256(content[_DIGEST:]).digest() != content[:_DIGEST]:
+        return None
+    return _compiled(export.deserialize(bytearray(content[_DIGEST:])))
+
+
+def _compiled(exported: export.Exported) -> Callable[..., Any]:
+    like = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in exported.in_avals]
+    return jax.jit(exported.call).lower(*like).compile()
+
+
+def _version() -> str:
+    """Return a digest of what programs depend on beside their arguments: this package's source, JAX, and the device."""
+    digest = hashlib.sha256()
+    package = Path(__file__).parent
+    for path in sorted(package.rglob("*.py")):
+        digest.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
+    settings = [jax.config.values[name] for name in ("jax_enable_x64", "jax_default_matmul_precision")]
+    facts = (jax.__version__, jaxlib.__version__, jax.default_backend(), *settings, os.environ.get("XLA_FLAGS"))
+    digest.update(repr(facts).encode())
+    return digest.hexdigest()[:32]
+
+
+def _forget_old(folder: Path) -> None:
+    """Remove what versions that were not used lately have left."""
+    folders = sorted((path for path in folder.iterdir() if path.is_dir()), key=lambda path: -path.stat().st_mtime)
+    for old in folders[_FOLDERS:]:
+        shutil.rmtree(old, ignore_errors=True)

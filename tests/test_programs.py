@@ -1,0 +1,173 @@
+"""Programs and parts that are kept for the next process: the same results, without tracing; damage is no failure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+
+from kmn_jax import programs
+from kmn_jax.detection import PoseEstimator, prepare_kept
+from kmn_jax.errors import InputError
+from kmn_jax.programs import KeptProgram, keep_programs, kept, kept_folder, read_kept
+
+INDUSTRIAL = Path(__file__).parents[1] / "experiments" / "assets" / "industrial"
+
+
+class Pair(NamedTuple):
+    """A result of two arrays."""
+
+    total: Array
+    scaled: Array
+
+
+def counted() -> tuple[KeptProgram[..., Pair], list[int]]:
+    """Return a program and the list of its traces."""
+    traces: list[int] = []
+
+    def scaled_sum(values: Pair, key: Array, factor: float) -> Pair:
+        traces.append(1)
+        return Pair(values.total.sum(), values.scaled * factor + jax.random.uniform(key))
+
+    return kept("factor", results=(Pair,))(scaled_sum), traces
+
+
+def given(size: int = 3) -> tuple[Pair, Array]:
+    return Pair(jnp.arange(float(size)), jnp.ones(2)), jax.random.key(1)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[Path]:
+    keep_programs(tmp_path)
+    yield tmp_path
+    keep_programs(None)
+
+
+def next_process(folder: Path) -> None:
+    """Forget what this process has compiled, and read what is kept."""
+    keep_programs(folder)
+    read_kept()
+
+
+def files(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*/*.export"))
+
+
+def test_another_process_gets_the_same_without_tracing(folder: Path) -> None:
+    program, traces = counted()
+    first = program(*given(), factor=2.0)
+    assert sum(traces) == 1
+    next_process(folder)
+    again, traces = counted()
+    second = again(*given(), factor=2.0)
+    assert not traces
+    assert isinstance(second, Pair)
+    keep_programs(None)
+    plain = again(*given(), factor=2.0)
+    for result in (first, second):
+        jax.tree.map(np.testing.assert_array_equal, result, plain)
+
+
+def test_other_arguments_are_another_program(folder: Path) -> None:
+    program, traces = counted()
+    program(*given(), factor=2.0)
+    program(*given(), factor=2.0)
+    assert sum(traces) == 1
+    assert float(program(*given(), factor=3.0).scaled[0] - program(*given(), factor=2.0).scaled[0]) == pytest.approx(1)
+    assert program(*given(4), factor=2.0).total == 6
+    assert len(files(folder)) == 3
+
+
+def test_a_damaged_file_is_made_again(folder: Path) -> None:
+    program, traces = counted()
+    expected = program(*given(), factor=2.0)
+    (file,) = files(folder)
+    content = file.read_bytes()
+    file.write_bytes(content[:100] + b"?" + content[101:])
+    next_process(folder)
+    again, traces = counted()
+    jax.tree.map(np.testing.assert_array_equal, again(*given(), factor=2.0), expected)
+    assert sum(traces) == 1
+    next_process(folder)
+    again(*given(), factor=2.0)
+    assert sum(traces) == 1
+
+
+def test_inside_of_a_trace_it_is_a_part_of_the_trace(folder: Path) -> None:
+    program, _ = counted()
+    values, key = given()
+    mapped = jax.jit(jax.vmap(lambda total: program(Pair(total, values.scaled), key, factor=2.0).total))
+    np.testing.assert_array_equal(mapped(jnp.ones((2, 3))), [3, 3])
+    assert not files(folder)
+
+
+def test_what_cannot_be_exported_is_compiled_as_ever(folder: Path) -> None:
+    @kept()
+    def called(values: Float[Array, " n"]) -> Float[Array, " n"]:
+        return jax.pure_callback(lambda array: np.asarray(array) + 1, values, values)
+
+    np.testing.assert_array_equal(called(jnp.zeros(2)), [1, 1])
+    assert not files(folder)
+
+
+def test_a_folder_does_not_grow_without_bound(folder: Path) -> None:
+    program, _ = counted()
+    for size in range(1, programs._MOST + 3):
+        program(*given(size), factor=1.0)
+    assert len(files(folder)) == programs._MOST
+    for number in range(4):
+        (folder / f"version{number}").mkdir()
+    keep_programs(folder)
+    own = kept_folder()
+    assert own is not None
+    assert own.is_dir()
+    assert len(list(folder.iterdir())) == programs._FOLDERS
+
+
+def test_a_folder_that_cannot_be_made_is_done_without(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    keep_programs(tmp_path / "file")
+    assert kept_folder() is None
+    program, _ = counted()
+    assert program(*given(), factor=1.0).total == 3
+
+
+def test_a_part_is_made_once(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    estimator = PoseEstimator.from_pretrained()
+    source = tmp_path / "part.stl"
+    source.write_bytes((INDUSTRIAL / "screw.stl").read_bytes())
+    part = prepare_kept(estimator, source, None)
+    calls = []
+    real = PoseEstimator.prepare
+    monkeypatch.setattr(PoseEstimator, "prepare", lambda *given: calls.append(1) or real(*given))
+    again = prepare_kept(estimator, source, None)
+    assert not calls
+    for name in ("points", "normals", "features", "minimum", "maximum"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(part, name))
+    assert (again.name, again.unit, again.diameter, again.area) == (part.name, part.unit, part.diameter, part.area)
+
+    assert prepare_kept(estimator, source, "m").unit == "m"  # another unit, ...
+    source.write_bytes((INDUSTRIAL / "shaft.stl").read_bytes())
+    assert prepare_kept(estimator, source, None).diameter != part.diameter  # ... or another file is another part
+    assert len(calls) == 2
+
+
+def test_a_damaged_card_is_made_again_and_bad_files_are_told(folder: Path, tmp_path: Path) -> None:
+    estimator = PoseEstimator.from_pretrained()
+    part = prepare_kept(estimator, INDUSTRIAL / "screw.stl", None)
+    (card,) = folder.glob("*/parts/*.kmn")
+    content = card.read_bytes()
+    card.write_bytes(content[: len(content) // 2])
+    assert prepare_kept(estimator, INDUSTRIAL / "screw.stl", None).diameter == part.diameter
+    assert card.read_bytes() == content
+    (tmp_path / "part.stl").write_bytes(b"solid")
+    with pytest.raises(InputError, match=r"part\.stl"):
+        prepare_kept(estimator, tmp_path / "part.stl", None)
+    with pytest.raises(InputError, match=r"none\.stl"):
+        prepare_kept(estimator, tmp_path / "none.stl", None)
