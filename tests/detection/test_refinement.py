@@ -6,9 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
+from experiments.solids import box, union
 from kmn_jax.detection import DepthAgreementConfig, DevicePart, Scene, make_scene, symmetry_transforms
-from kmn_jax.detection._device_part import main_turns
+from kmn_jax.detection._look_alikes import MOST, look_alikes
 from kmn_jax.detection._refinement import refined_forms
 from kmn_jax.geometry import Camera, SmoothConfig, crop_around, measured_points
 from kmn_jax.io import Scan
@@ -16,7 +18,7 @@ from kmn_jax.objects import ObjectConfig, Part, PartArrays, object_from_mesh
 from kmn_jax.objects._symmetry import rotation_about
 from kmn_jax.pose import mssd
 from kmn_jax.simulate import RayMesh, Surfels, render
-from tests.reference.meshes import Mesh, bracket, camera_scene, notched_box, pose, random_rotations, tube
+from tests.reference.meshes import Mesh, camera_scene, notched_box, pose, random_rotations, tube
 from tests.reference.parts import box_part
 
 pytestmark = pytest.mark.usefixtures("few_optimisations")
@@ -50,7 +52,7 @@ def of_mesh(mesh: Mesh) -> Part:
 
 
 def turns_of(part: Part) -> tuple[np.ndarray, np.ndarray]:
-    return main_turns(part, symmetry_transforms(part.symmetries))
+    return look_alikes(part, symmetry_transforms(part.symmetries))
 
 
 @pytest.fixture(scope="module")
@@ -64,23 +66,47 @@ def view_of(mesh: Mesh, T_camera_object: np.ndarray) -> Scene:
     return make_scene(Scan(points, None, depth, CAMERA, "m"), 1.0, inside=np.ones(len(points), dtype=bool))
 
 
-def test_turns_are_rotations_about_the_centroid(part: Part) -> None:
-    turns, _ = turns_of(part)
-    assert turns.shape == (23, 4, 4)
+def test_look_alikes_lie_on_the_part_and_differ(part: Part) -> None:
+    turns, is_real = turns_of(part)
+    assert turns.shape == (MOST, 4, 4)
     np.testing.assert_allclose(np.linalg.det(turns[:, :3, :3]), 1, atol=1e-5)
-    center = np.append(part.points.mean(axis=0), 1)
-    np.testing.assert_allclose(turns @ center, np.tile(center, (23, 1)), atol=1e-5)
+    found = np.concatenate([np.eye(4, dtype=np.float32)[None], turns[is_real]])
+    surface = cKDTree(part.points)
+    for row, turn in enumerate(found):
+        moved = part.points[:300] @ turn[:3, :3].T + turn[:3, 3]
+        assert surface.query(moved)[0].mean() < 0.1 * part.diameter
+        for other in found[:row]:
+            assert float(mssd(turn, other, part.points[:300])) > 0.08 * part.diameter
 
 
-def test_rivals_look_nearly_the_same_but_not_quite(part: Part) -> None:
-    turns, is_rival = turns_of(part)
-    halves = (np.abs(np.diagonal(turns[:, :3, :3], axis1=1, axis2=2)) > 0.99).all(axis=1)
-    assert halves.sum() == 3
-    assert is_rival[halves].all()
-    assert is_rival.sum() <= 4  # the box is too long for most others
-    assert not turns_of(of_mesh(bracket()))[1].any()
+def test_a_box_with_a_notch_is_mistaken_for_its_half_turns(part: Part) -> None:
+    turns, is_real = turns_of(part)
+    center = part.points.mean(axis=0)
+    for axis in np.eye(3):
+        half = np.eye(4, dtype=np.float32)
+        half[:3, :3] = rotation_about(axis, np.pi)
+        half[:3, 3] = center - half[:3, :3] @ center
+        apart = [float(mssd(turn, half, part.points[:300])) for turn in turns[is_real]]
+        assert min(apart) < 0.15 * part.diameter
+
+
+def test_a_bracket_is_mistaken_for_itself_with_its_legs_exchanged() -> None:
+    part = of_mesh(union(box((0, 0, 0), (1.0, 0.6, 0.1)), box((0, 0, 0), (0.1, 0.6, 0.8))))
+    turns, is_real = turns_of(part)
+    exchanged = np.array([[0, 0, 1], [0, -1, 0], [1, 0, 0]], dtype=np.float32)
+    turned = turns[is_real]
+    cosine = (np.trace(np.swapaxes(turned[:, :3, :3], 1, 2) @ exchanged, axis1=1, axis2=2) - 1) / 2
+    row = int(np.argmax(cosine))
+    assert cosine[row] > np.cos(np.radians(10))
+    np.testing.assert_allclose(turned[row] @ [0, 0.3, 0, 1], [0, 0.3, 0, 1], atol=0.1)  # the corner stays
+
+
+def test_a_symmetry_is_no_look_alike() -> None:
     symmetries = np.stack([np.eye(3), *(rotation_about(axis, np.pi) for axis in np.eye(3))])
-    assert 23 - turns_of(box_part(2000, rotations=symmetries))[1].sum() >= 3
+    part = box_part(2000, rotations=symmetries)
+    turns, is_real = turns_of(part)
+    halves = (np.abs(np.diagonal(turns[:, :3, :3], axis1=1, axis2=2)) > 0.99).all(axis=1)
+    assert not (halves & is_real & (np.abs(turns[:, :3, 3]).max(axis=1) < 0.05 * part.diameter)).any()
 
 
 def forms_of(part: Part, scene: Scene, starts: np.ndarray, is_rival: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -119,5 +145,5 @@ def test_a_pipe_is_not_drawn_to_its_bore() -> None:
     assert inwards[:512].mean() > 0.3  # there is a bore that points may be drawn to
     starts = np.tile(lying.astype(np.float32), (3, 1, 1))
     starts[:, 2, 3] += [-0.02, 0.02, 0.04]
-    found, _ = forms_of(pipe, view_of(mesh, lying), starts, np.zeros(23, dtype=bool))
+    found, _ = forms_of(pipe, view_of(mesh, lying), starts, np.zeros(MOST, dtype=bool))
     assert np.abs(found[:, 0, 2, 3] - lying[2, 3]).max() < wall / 6
