@@ -72,6 +72,17 @@ def read_kept() -> None:
         _store.begin()
 
 
+def meanwhile(work: Callable[[], object]) -> None:
+    """Do in the background, in a process that found nothing kept, what will be asked for later: compiling takes long.
+
+    Whatever goes wrong goes wrong later on as well, where it is told.
+    """
+    if _store is not None and not _store.read:
+        pool = ThreadPoolExecutor(1, thread_name_prefix="programs")
+        pool.submit(work)
+        pool.shutdown(wait=False)
+
+
 def kept(
     *static: str, results: tuple[type, ...] = ()
 ) -> Callable[[Callable[_Arguments, _Result]], KeptProgram[_Arguments, _Result]]:
@@ -123,7 +134,7 @@ class _Store:
         self.folder.mkdir(parents=True, exist_ok=True)
         os.utime(self.folder)
         _forget_old(folder)
-        self.programs: dict[Any, Any] = {}
+        self.programs: dict[Any, Future[Callable[..., Any] | None]] = {}
         self.lock = Lock()
         self.read: dict[str, Future[Any]] = {}
 
@@ -141,16 +152,22 @@ class _Store:
     ) -> Callable[..., Any] | None:
         """Return the program for arguments like these; None if it cannot be exported."""
         key = (of.function, *fixed.values(), tree, shapes)
-        found = self.programs.get(key, self)
-        if found is not self:
-            return cast("Callable[..., Any] | None", found)
         with self.lock:  # of two threads that ask for the same program, one makes it
-            if key not in self.programs:
-                text = "\n".join(map(repr, (*fixed.items(), tree, shapes)))
-                name = f"{of.function.__name__}-{hashlib.sha256(text.encode()).hexdigest()[:32]}.export"
-                read = self.read.get(name)
-                self.programs[key] = (read and read.result()) or self._make(name, of, fixed, tree, leaves)
-            return cast("Callable[..., Any] | None", self.programs[key])
+            found = self.programs.get(key)
+            made: Future[Callable[..., Any] | None] = Future()
+            if found is None:
+                self.programs[key] = made
+        if found is not None:
+            return found.result()
+        try:
+            text = "\n".join(map(repr, (*fixed.items(), tree, shapes)))
+            name = f"{of.function.__name__}-{hashlib.sha256(text.encode()).hexdigest()[:32]}.export"
+            read = self.read.get(name)
+            made.set_result((read and read.result()) or self._make(name, of, fixed, tree, leaves))
+        except BaseException as error:
+            made.set_exception(error)
+            raise
+        return made.result()
 
     def _make(
         self, name: str, of: KeptProgram[Any, Any], fixed: dict[str, Any], tree: Any, leaves: list[Any]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 from typing import NamedTuple
 
 import jax
@@ -171,3 +173,22 @@ def test_a_damaged_card_is_made_again_and_bad_files_are_told(folder: Path, tmp_p
         prepare_kept(estimator, tmp_path / "part.stl", None)
     with pytest.raises(InputError, match=r"none\.stl"):
         prepare_kept(estimator, tmp_path / "none.stl", None)
+
+
+def test_two_threads_make_a_program_once(folder: Path) -> None:
+    program, traces = counted()
+    with ThreadPoolExecutor(4) as pool:
+        totals = list(pool.map(lambda _: float(program(*given(), factor=2.0).total), range(8)))
+    assert totals == [3.0] * 8
+    assert sum(traces) == 1
+
+
+def test_work_is_done_ahead_in_a_process_that_found_nothing(folder: Path) -> None:
+    done = Event()
+    programs.meanwhile(done.set)
+    assert done.wait(10)
+    counted()[0](*given(), factor=2.0)
+    next_process(folder)
+    programs.meanwhile(lambda: pytest.fail("programs were kept"))
+    keep_programs(None)
+    programs.meanwhile(lambda: pytest.fail("nothing is kept"))

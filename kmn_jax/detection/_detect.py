@@ -29,6 +29,7 @@ from kmn_jax.detection._timing import Clock
 from kmn_jax.errors import InputError
 from kmn_jax.models import Model
 from kmn_jax.objects import Part
+from kmn_jax.programs import meanwhile
 
 _SHARES = ("explained", "violated", "occluded", "unknown")
 _CLOSE_GAP = 0.05  # of probabilities
@@ -91,6 +92,7 @@ def detect(
     on_device, warnings = device_part(model, part), scene.warnings
     propose = partial(search_at, model, on_device, scene, random_seed=random_seed, config=search)
     if at is None:
+        meanwhile(partial(refine_any, on_device, scene, search))
         found, more = explore(scene, part, propose, probabilities.found, config, clock)
         warnings = (*warnings, *more)
     else:
@@ -149,6 +151,13 @@ def explore(
             warnings = (f"{left:.0%} of the foreground was not searched: narrow it down to where the object may be",)
             break
     return join(rounds), warnings
+
+
+def refine_any(on_device: DevicePart, scene: Scene, config: SearchConfig) -> None:
+    """Refine some pose, whose only use is that it compiles."""
+    pose, row = jax.device_put((np.eye(4, dtype=np.float32), np.int32(0)))
+    given = (on_device, scene.cloud, scene.image, config.crops.smooth, config.agreement)
+    refine_one(pose, row, jax.random.key(0), *given)
 
 
 def refined_candidates(
