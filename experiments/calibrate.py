@@ -4,7 +4,9 @@ Poses are searched in the validation bins (`python -m experiments.build_data val
 network was not trained with, and with `--worlds` in the whole scans of world bins; in every second one also a part that
 is not there. A small model of the evidence is fitted to whether they are right. Each object's probabilities are also
 predicted by a model that was fitted without it, which gives the reliability that is printed. The model of poses as
-they are found is fitted first: it chooses which of them are refined, here as in detection.
+they are found is fitted first: it chooses which of them are refined, here as in detection. Of refined poses detection
+reports one for each place. Models are too sure of themselves about kinds of objects that they were not fitted to: so
+the scale of the refined poses' model is fitted to what detection would report by models that do not know the kind.
 """
 
 from __future__ import annotations
@@ -18,12 +20,14 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import tyro
+from jaxtyping import Float, Int
 from tqdm import tqdm
 
 from experiments.bins import THRESHOLD, TrueImage, bin_images, world_images
 from experiments.fpfh import fpfh_poses
 from experiments.reliability_picture import reliability_table, save_reliability
 from experiments.test_sets import SPLIT
+from experiments.worlds import PARTS_A_FAMILY
 from kmn_jax.detection import (
     EVIDENCE,
     Calibration,
@@ -75,7 +79,7 @@ class Search(NamedTuple):
     image: TrueImage
     part: Part  # the image's own, or its stranger
     scene: Scene
-    number: int  # that searches of one object share
+    number: int  # that searches of one object, or of one family of parts, share
     found: Candidates
 
     def columns(self, found: Candidates) -> dict[str, np.ndarray]:
@@ -94,16 +98,23 @@ def collect(options: Options) -> dict[str, np.ndarray]:
     config = DetectConfig().search
     config = replace(config, crops=config.crops.of_network(model.config))
     searches = list(_searches(options, model, config))
-    found = [search.columns(search.found) for search in searches]
-    every = _joined(found)
-    chooser = fit_calibration(every["evidence"], every["error"] < THRESHOLD, EVIDENCE)
-    refined = [
-        search.columns(refined)
+    found = _joined([search.columns(search.found) for search in searches])
+    chooser = fit_calibration(found["evidence"], found["error"] < THRESHOLD, EVIDENCE)
+    pairs = [
+        (search, refined)
         for search in tqdm(searches, unit="search", desc="refinement")
         if (refined := _refined(model, search, chooser, config)) is not None
     ]
-    stages = [column | {"refined": np.zeros(len(column["error"]), dtype=bool)} for column in found]
-    return _joined([*stages, *(column | {"refined": np.ones(len(column["error"]), dtype=bool)} for column in refined)])
+    fine = _joined([search.columns(refined) for search, refined in pairs])
+    fine["refined"] = np.ones(len(fine["error"]), dtype=bool)
+    others = {name: fitted for names, fitted in held_out_models(fine, options) for name in names}
+    kept = []
+    for search, refined in pairs:
+        choice = chosen(refined, others[search.number], device_part(model, search.part), DetectConfig())
+        kept.append(choice.kept[refined.usable])
+    none = np.zeros(len(found["error"]), dtype=bool)
+    found |= {"refined": none, "reported": none}
+    return _joined([found, fine | {"reported": np.concatenate(kept)}])
 
 
 def _joined(columns: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -126,7 +137,7 @@ def _searches(options: Options, model: Model, config: SearchConfig) -> Iterator[
 
 
 def _images(options: Options, model: Model) -> Iterator[tuple[int, TrueImage, Scene]]:
-    """Yield all images with their scenes, and a number that those of one object share."""
+    """Yield all images with their scenes, and a number that those of one object share, or of one family of parts."""
     folders = sorted(path for path in options.bins.glob("*") if (path / SPLIT).is_dir())
     if not folders:
         raise InputError(f"{options.bins} holds no datasets: python -m experiments.build_data validation-bins")
@@ -136,7 +147,7 @@ def _images(options: Options, model: Model) -> Iterator[tuple[int, TrueImage, Sc
     if options.worlds is not None:
         for found in tqdm(world_images(options.worlds, model), unit="image", desc="worlds"):
             with suppress(InputError):  # a scan without foreground, as of an empty table
-                yield found.object_id, found, make_scene(found.scan, found.part.diameter)
+                yield (found.object_id - 1) // PARTS_A_FAMILY, found, make_scene(found.scan, found.part.diameter)
 
 
 def _refined(model: Model, search: Search, chooser: Calibration, config: SearchConfig) -> Candidates | None:
@@ -147,31 +158,58 @@ def _refined(model: Model, search: Search, chooser: Calibration, config: SearchC
     return refined_candidates(on_device, search.scene, search.found, rows, 0, config) if len(rows) else None
 
 
-def fit(poses: dict[str, np.ndarray], absent_weight: float, folds: int) -> tuple[Calibration, dict[str, Any]]:
-    """Return the model of all poses, and how well models predict the objects that they were not fitted to."""
-    evidence, error, objects = (poses[column] for column in ("evidence", "error", "object"))
-    right, there = error < THRESHOLD, np.isfinite(error)
-    weights = np.where(there, 1.0, absent_weight)
+def held_out_models(
+    poses: dict[str, np.ndarray], options: Options
+) -> Iterator[tuple[Int[np.ndarray, " o"], Calibration]]:
+    """Yield some objects, and the model that is fitted to the poses of all others, until each had its turn."""
+    names = np.unique(poses["object"])
+    for fold in range(options.folds):
+        own = names[fold :: options.folds]
+        others = ~np.isin(poses["object"], own)
+        if len(own):
+            yield own, _model({column: values[others] for column, values in poses.items()}, options)
+
+
+def _model(poses: dict[str, np.ndarray], options: Options) -> Calibration:
+    return fit_calibration(poses["evidence"], poses["error"] < THRESHOLD, EVIDENCE, _weights(poses, options))
+
+
+def _weights(poses: dict[str, np.ndarray], options: Options) -> Float[np.ndarray, " s"]:
+    """Return how much poses count: refined ones of absent parts more than others."""
+    absent = ~np.isfinite(poses["error"])
+    return np.where(absent & poses["refined"], options.absent_weight, 1.0)
+
+
+def fit(poses: dict[str, np.ndarray], options: Options) -> tuple[Calibration, dict[str, Any]]:
+    """Return the model of all poses, and how well models predict the objects that they were not fitted to.
+
+    Where some poses are those that detection reports, the scale of the model is fitted to them, as models of other
+    objects predict them, and they are what is judged.
+    """
+    right, there = poses["error"] < THRESHOLD, np.isfinite(poses["error"])
     held_out = np.zeros(len(right))
-    names = np.unique(objects)
-    for fold in range(folds):
-        own = np.isin(objects, names[fold::folds])
-        others = fit_calibration(evidence[~own], right[~own], EVIDENCE, weights[~own])
-        held_out[own] = others.probability(evidence[own])
-    model = fit_calibration(evidence, right, EVIDENCE, weights)
-    accepted = held_out >= DetectConfig().accepted
+    for names, others in held_out_models(poses, options):
+        own = np.isin(poses["object"], names)
+        held_out[own] = others.logit(poses["evidence"][own])
+    model = _model(poses, options)
+    judged = poses["reported"] if poses["reported"].any() else np.ones_like(right)
+    if poses["reported"].any():
+        few = held_out[judged, None], right[judged], ("logit",), _weights(poses, options)[judged]
+        scale = fit_calibration(*few, hidden_units=0)
+        model, held_out = model.scaled(scale.weights[0], scale.bias), scale.weights[0] * held_out + scale.bias
+    probability, right, there = 1 / (1 + np.exp(-held_out[judged])), right[judged], there[judged]
+    accepted = probability >= DetectConfig().accepted
     present = accepted & there
     summary = {
-        "objects": len(names),
+        "objects": len(np.unique(poses["object"])),
         "poses": len(right),
         "right": float(right.mean()),
-        "expected calibration error": expected_calibration_error(held_out, right),
+        "expected calibration error": expected_calibration_error(probability, right),
         "right among accepted": float(right[accepted].mean()) if accepted.any() else None,
         "right among accepted where the part is": float(right[present].mean()) if present.any() else None,
         "accepted among right": float(accepted[right].mean()),
     }
-    table = reliability_table(held_out, right)
-    return model, {"summary": summary, "reliability": table}
+    return model, {"summary": summary, "reliability": reliability_table(probability, right)}
 
 
 def calibrate(options: Options) -> dict[str, Any]:
@@ -189,8 +227,7 @@ def calibrate(options: Options) -> dict[str, Any]:
             np.savez(options.candidates, allow_pickle=False, **poses)
     models, results = [], {}
     for name, own in (("found", ~poses["refined"]), ("refined", poses["refined"])):
-        weight = options.absent_weight if name == "refined" else 1.0
-        model, results[name] = fit({column: values[own] for column, values in poses.items()}, weight, options.folds)
+        model, results[name] = fit({column: values[own] for column, values in poses.items()}, options)
         models.append(model)
         print_table(f"Reliability of poses as {name}, of objects that were not fitted to", results[name]["reliability"])
         print_table(f"Poses as {name}", [results[name]["summary"]])

@@ -50,7 +50,7 @@ from kmn_jax.simulate import (
 )
 
 NAMES, TARGETS = "worlds.json", "test_targets_bop19.json"
-_PARTS_A_FAMILY = 2
+PARTS_A_FAMILY = 2
 _ABSENT = 4  # of so many images one shows no copy of the part that is asked for
 _KINDS = 3  # of other parts in an image, those of about the size of the one that is asked for
 _TRIES = 6  # of an image's container, until parts come to rest in it
@@ -118,7 +118,7 @@ def build_worlds(folder: Path, recipe: Recipe, workers: int | None = None) -> st
     """
     claim(folder, asdict(recipe))
     (folder / ".parts").mkdir(exist_ok=True)
-    parts = write_parts(folder / ".parts", recipe.parts, _PARTS_A_FAMILY, recipe.random_seed)
+    parts = write_parts(folder / ".parts", recipe.parts, PARTS_A_FAMILY, recipe.random_seed)
     numbers = range(1, len(recipe.families) + 1)
     write_scenes(folder, _write_family, dict.fromkeys(numbers, (recipe, parts)), parts, workers)
     targets = [

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -75,7 +75,16 @@ class Calibration:
 
     def probability(self, evidence: Float[np.ndarray, "s f"]) -> Float[np.ndarray, " s"]:
         """Return the probability that each pose is right."""
-        return _logistic(self.arrays().logits(evidence.astype(np.float64), np))
+        return _logistic(self.logit(evidence))
+
+    def logit(self, evidence: Float[np.ndarray, "s f"]) -> Float[np.ndarray, " s"]:
+        """Return the logarithm of the odds that each pose is right."""
+        return self.arrays().logits(evidence.astype(np.float64), np)
+
+    def scaled(self, factor: float, offset: float) -> Calibration:
+        """Return the model whose logits are these times a factor, plus an offset."""
+        weights, slopes = ([factor * value for value in values] for values in (self.weights, self.hidden_slopes))
+        return replace(self, weights=tuple(weights), hidden_slopes=tuple(slopes), bias=factor * self.bias + offset)
 
 
 def fit_calibration(
