@@ -194,8 +194,7 @@ def fit(poses: dict[str, np.ndarray], options: Options) -> tuple[Calibration, di
     model = _model(poses, options)
     judged = poses["reported"] if poses["reported"].any() else np.ones_like(right)
     if poses["reported"].any():
-        few = held_out[judged, None], right[judged], ("logit",), _weights(poses, options)[judged]
-        scale = fit_calibration(*few, hidden_units=0)
+        scale = fit_calibration(held_out[judged, None], right[judged], ("logit",), hidden_units=0)
         model, held_out = model.scaled(scale.weights[0], scale.bias), scale.weights[0] * held_out + scale.bias
     probability, right, there = 1 / (1 + np.exp(-held_out[judged])), right[judged], there[judged]
     accepted = probability >= DetectConfig().accepted

@@ -54,7 +54,7 @@ class DetectConfig:
     later_seeds: int = 16  # at most in a round after the first; rounds go on until the foreground is covered
     most_seeds: int = 512  # at least so many are searched before it is given up to cover the foreground
     likely: float = 0.5  # the probability from which on a pose, as it is found, explains points: they are done
-    accepted: float = 0.7  # that from which on a pose counts as found: in world bins 95% of such poses are right
+    accepted: float = 0.8  # that from which on a pose counts as found: in world bins 95% of such poses are right
     reported: float = 0.1  # less probable poses are left out
 
     def __post_init__(self) -> None:
