@@ -29,6 +29,7 @@ check: $(READY) ## format, lint and types, changing nothing
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy $(TYPED)
+	MYPYPATH=ros2/kmn_ros $(BIN)/mypy ros2/kmn_ros/kmn_ros
 
 format: $(READY) ## format and apply the safe lint fixes
 	$(BIN)/ruff format .
