@@ -165,7 +165,7 @@ class Viewer:
     def _list_poses(self, found: Detections) -> None:
         """Add the poses of a result."""
         self.found = found
-        self._list = PoseList(self._server, self._scene, self._part, found, float(self._least.value), self._is_idle)
+        self._list = PoseList(self._server, self._scene, self._part, found, float(self._least.value), self._on_pose)
         self._back.visible = found is not self._first
         if found is self._first:
             self._scene.mark.visible = False
@@ -194,8 +194,12 @@ class Viewer:
         name = None if self._view.source is None else Path(self._view.source).name
         return heading(self.found, name, len(self._view.points), doing)
 
-    def _is_idle(self) -> bool:
-        return self._picking == "off"
+    def _on_pose(self, rank: int, event: Any) -> None:
+        """Take a click on a pose for one on the scan before it if a point is to be picked, else choose the pose."""
+        if self._picking == "armed":
+            self._clicked(event)
+        elif self._picking == "off":
+            self._list.choose(rank)
 
     def _toggle_picking(self) -> None:
         with self._lock:

@@ -28,14 +28,10 @@ class PoseList:
         part: Part,
         found: Detections,
         least: float,
-        may_choose: Callable[[], bool],
+        on_click: Callable[[int, Any], None],
     ) -> None:
-        """Add them; those that are less probable than `least` are hidden.
-
-        A click on a pose chooses it if `may_choose` says so: clicks can be meant for the scan.
-        """
+        """Add them; those that are less probable than `least` are hidden; `on_click` gets ranks and clicks on them."""
         self._gui, self._part, self._found, self._least = server.gui, part, found, least
-        self._may_choose = may_choose
         self.nodes: list[PoseNodes] = []
         self._switches: list[Any] = []
         self._lines: list[Any] = []
@@ -53,7 +49,7 @@ class PoseList:
             colors = distinct_colors(len(poses))
             for rank, (pose, color, warnings) in enumerate(zip(poses, colors, own, strict=True), start=1):
                 nodes = scene.add_pose(rank, pose, color, len(poses))
-                nodes.layers["Surfaces"].on_click(lambda _, rank=rank: self._clicked(rank))
+                nodes.layers["Surfaces"].on_click(lambda event, rank=rank: on_click(rank, event))
                 switch = self._gui.add_checkbox(f"Pose {rank}", True)
                 switch.on_update(lambda _: self._apply())
                 self.nodes.append(nodes)
@@ -83,10 +79,6 @@ class PoseList:
         for nodes in self.nodes:
             nodes.frame.remove()
         self._folder.remove()
-
-    def _clicked(self, rank: int) -> None:
-        if self._may_choose():
-            self.choose(rank)
 
     def _apply(self) -> None:
         rows = zip(self._found.poses, self.nodes, self._switches, self._lines, strict=True)
