@@ -23,7 +23,6 @@ LONGEST = (
     "viz/test_viewer.py",
     "viz/test_viewer_panel.py",
     "train/test_examples.py",
-    "test_docs_commands.py",
     "simulate/test_physics.py",
     "simulate/test_splat.py",
     "ros/test_results.py",
