@@ -5,8 +5,10 @@ UV := 0.13.9
 
 BIN := .venv/bin
 READY := .venv/.ready
+BROWSER_SOUGHT := .venv/.browser-sought
 BENCH_READY := .venv/.bench-ready
 COMPILE_READY := .venv-compile/.ready
+UV_READY := .venv-lock/.ready-$(UV)
 NEWEST ?= python3.12
 TYPED := $(sort $(patsubst %/,%,$(dir $(wildcard kmn_jax/*.py configs/*.py experiments/*.py benchmarks/*.py))))
 COMPILE := .venv-lock/bin/uv --no-config pip compile --quiet --generate-hashes --no-emit-index-url \
@@ -14,7 +16,7 @@ COMPILE := .venv-lock/bin/uv --no-config pip compile --quiet --generate-hashes -
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test check format bench bench-env compile-env newest attack docs lock clean
+.PHONY: help demo test check format bench bench-env compile-env newest attack docs lock platforms clean
 
 help: ## list these verbs
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' Makefile
@@ -22,13 +24,14 @@ help: ## list these verbs
 demo: $(READY) ## find parts in the small test set beside two rivals, and write a report
 	$(BIN)/python -m experiments.evaluate demo
 
-test: $(READY) ## run the tests
+test: $(READY) $(BROWSER_SOUGHT) ## run the tests
 	$(BIN)/python -m pytest
 
 check: $(READY) ## format, lint and types, changing nothing
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy $(TYPED)
+	MYPYPATH=ros2/kmn_ros $(BIN)/mypy ros2/kmn_ros/kmn_ros
 
 format: $(READY) ## format and apply the safe lint fixes
 	$(BIN)/ruff format .
@@ -54,18 +57,28 @@ docs: $(READY) ## build the documentation into site/, and run the examples of RE
 	$(BIN)/mkdocs build --strict
 	$(BIN)/python -m pytest tests/test_docs.py
 
-lock: ## compile pyproject.toml into the two locks (LOCK=--upgrade for newer versions)
-	$(PYTHON) -m venv .venv-lock
-	.venv-lock/bin/python -m pip install --quiet uv==$(UV)
+lock: $(UV_READY) ## compile pyproject.toml into the two locks (LOCK=--upgrade for newer versions)
 	$(COMPILE) --universal --fork-strategy fewest --extra dev pyproject.toml -o requirements.lock
 	printf 'torch==$(TORCH)\n' | $(COMPILE) --constraints requirements.lock --no-emit-package torch \
 		--no-annotate --python-version 3.11 --python-platform windows - -o requirements-bench.lock
+
+platforms: $(UV_READY) ## see that requirements.lock has wheels for all platforms and versions of Python
+	UV=.venv-lock/bin/uv .ci/platforms
 
 clean: ## remove the environments and caches
 	rm -rf .venv .venv-lock .venv-compile .venv-newest .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist site
 
 $(READY): requirements.lock pyproject.toml .ci/environment
 	PYTHON="$(PYTHON)" .ci/environment
+	@touch $@
+
+$(UV_READY):
+	$(PYTHON) -m venv .venv-lock
+	.venv-lock/bin/python -m pip install --quiet uv==$(UV)
+	@touch $@
+
+$(BROWSER_SOUGHT): $(READY)
+	.ci/environment browser
 	@touch $@
 
 # PyTorch's wheel differs from machine to machine (CPU or CUDA build, often a local file), so it has a version and no

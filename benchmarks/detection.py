@@ -8,6 +8,7 @@ repeats: once as it is, and once with the inside of the bin as foreground, as wi
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from tqdm import tqdm
 
 from experiments.bins import bin_images
 from kmn_jax.detection import PoseEstimator, Scene
+from kmn_jax.errors import InputError
 from kmn_jax.geometry import measured_points
 from kmn_jax.io import Scan
 from kmn_jax.objects import Part
@@ -74,4 +76,7 @@ def _row(estimator: PoseEstimator, part: Part, given: Scan | Scene, repeats: int
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    try:
+        tyro.cli(main)
+    except InputError as error:
+        sys.exit(f"detection: {error}")

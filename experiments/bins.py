@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
+from experiments.made_data import require_made
 from experiments.test_sets import SPLIT
 from experiments.worlds import NAMES, TARGETS, kind_of
 from kmn_jax.bop import BopDataset, BopFrame, BopInstance, FrameKey
@@ -163,6 +164,7 @@ def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldIm
 
 def _opened(folder: Path, split: str, model: Model) -> tuple[BopDataset, dict[int, Part]]:
     """Return a dataset and its parts. Raises InputError if one cannot be used."""
+    require_made(folder)
     dataset = BopDataset(folder, split, unit=_UNIT)
     models, problems = load_models(dataset, ObjectConfig(num_points=4096))
     if problems:

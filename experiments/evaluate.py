@@ -30,6 +30,7 @@ from experiments.evaluation.scores import cells_of
 from experiments.evaluation.sources import Report, bop_objects, cloud_objects
 from experiments.evaluation.tuned import RIVALS, without_package
 from experiments.evaluation.versions import shared_versions, versions_of
+from experiments.made_data import require_made
 from experiments.test_sets import SPLIT, build_test_set
 from kmn_jax.bop import NAMES_FILE, dataset_digest
 from kmn_jax.data import Source
@@ -221,7 +222,10 @@ def run(command: str, text: str, function: Callable[[Options], Path], arguments:
             print(f"{text}\nNames: {', '.join(CONFIGS)}. Fields: python -m experiments.{command} NAME --help")
             return 0 if name in ("-h", "--help") else 2
         default = Options(find_config(name))
-        page = function(tyro.cli(Options, default=default, args=rest, prog=f"experiments.{command} {name}"))
+        options = tyro.cli(Options, default=default, args=rest, prog=f"experiments.{command} {name}")
+        if options.config.cad is None:  # else the bins are made of it now
+            require_made(options.config.folder)
+        page = function(options)
     except InputError as error:
         print(f"{command}: {error}", file=sys.stderr)
         return 2

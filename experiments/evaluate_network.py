@@ -19,6 +19,7 @@ import jax
 import numpy as np
 import tyro
 
+from experiments.made_data import require_made
 from kmn_jax.bop import NAMES_FILE
 from kmn_jax.data import CropConfig, DevicePack, Pack, PipelineConfig, SampleBatches, stack_pack
 from kmn_jax.errors import InputError
@@ -188,6 +189,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Evaluate a network: 0 is success, 2 bad input, in one sentence on stderr."""
     try:
         options = tyro.cli(Options, args=arguments, prog="experiments.evaluate_network", description=__doc__)
+        require_made(*options.test_sets)
         results = evaluate(options)
         write_json(options.json, results)
     except InputError as error:

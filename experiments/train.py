@@ -15,6 +15,7 @@ from typing import Annotated
 import tyro
 
 from configs import CONFIGS, find_config
+from experiments.made_data import require_made
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import ask_for_fast_selection
 from kmn_jax.train import NotFiniteError, TrainConfig, initialize_distributed, split_cpu, train
@@ -41,6 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"{__doc__}\nNames: {', '.join(CONFIGS)}. Fields: python -m experiments.train NAME --help")
             return 0 if name in ("-h", "--help") else 2
         options = _parse(name, rest)
+        require_made(options.config.pack, options.config.rendered)
         folder = options.folder or Path("runs") / name
         ask_for_fast_selection()
         if not initialize_distributed(options.coordinator, options.processes, options.process):

@@ -22,7 +22,7 @@ from kmn_jax.files import check_output, write_whole
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-    from kmn_jax.detection import Detections
+    from kmn_jax.detection import Detections, Scene
     from kmn_jax.serve import ServerAnswer
     from kmn_jax.units import Unit
 
@@ -156,7 +156,7 @@ def view(
     host: str = "127.0.0.1",
     port: int = 8080,
 ) -> None:
-    """Show scan, poses and keypoints in the browser; a picked point is searched there and then.
+    """Show scan, poses and keypoints in the browser; a picked point, or the folder's next scan, is searched there.
 
     Args:
         request: what to look for, and where.
@@ -164,13 +164,21 @@ def view(
         port: port to serve on.
     """
     from kmn_jax.detection import table
-    from kmn_jax.viz import Viewer
+    from kmn_jax.viz import Viewer, check_page, one_after_the_other, part_mesh
 
+    check_page(host, port)
     session = _Session(request)
     found = session.detect(session.places)
     print(table(found, session.estimator.config.accepted))
     with Viewer(
-        session.scene, session.part, found, host, port, on_pick=lambda point: session.detect(point[None])
+        session.scene,
+        session.part,
+        found,
+        host,
+        port,
+        on_pick=lambda point: session.detect(point[None]),
+        on_next=one_after_the_other(request.scene, session.go_on, request.background),
+        mesh=part_mesh(request.object, session.part),
     ) as page:
         print(f"open {page.url}; stop with Ctrl+C", flush=True)
         page.wait()
@@ -301,15 +309,22 @@ class _Session:
             empty = None
             if request.background is not None:
                 empty = self.estimator.read(request.background, self.part, request.units, request.camera)
-            self.scene = self.estimator.scene(
-                request.scene,
-                self.part,
-                unit=request.units,
-                camera=request.camera,
-                sensor=sensor,
-                at=self.places,
-                background=ForegroundOptions(empty, region, request.plane),
-            )
+            self._known: Any = {
+                "unit": request.units,
+                "camera": request.camera,
+                "sensor": sensor,
+                "at": self.places,
+                "background": ForegroundOptions(empty, region, request.plane),
+            }
+            self.scene = self.estimator.scene(request.scene, self.part, **self._known)
+
+    def go_on(self, path: Path) -> tuple[Scene, Detections]:
+        """Search another scan of the same kind."""
+        with self._clock("scene"):
+            scene = self.estimator.scene(path, self.part, **self._known)
+        require(scene.unit == self.scene.unit, f"{path} is in {scene.unit}, but the one before in {self.scene.unit}")
+        self.scene = scene
+        return scene, self.detect(self.places)
 
     def detect(self, places: Float[np.ndarray, "k 3"] | None, top: int | None = None) -> Detections:
         """Search the scan, or places of it only."""

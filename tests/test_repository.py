@@ -1,8 +1,11 @@
-"""The locks are in step with pyproject.toml and with each other; the order of tests names files that there are."""
+"""The locks are in step with pyproject.toml and with each other, what sets things up, and the order of tests."""
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
+import subprocess
 import tomllib
 from pathlib import Path
 
@@ -56,6 +59,34 @@ def test_locks_agree() -> None:
         name: bench[name][0] for name in main.keys() & bench
     }
     assert "torch" not in main | bench
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+@pytest.mark.parametrize(("verb", "seeks"), [("demo", False), ("test", True)])
+def test_only_tests_seek_a_browser(verb: str, seeks: bool) -> None:
+    says = subprocess.run(["make", "-nB", verb], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert (".ci/environment browser" in says) == seeks
+
+
+@pytest.mark.parametrize("refused", ["", "aarch64-apple-darwin 3.12"])
+def test_platforms_that_lack_a_wheel_are_named(refused: str, tmp_path: Path) -> None:
+    stand_in = tmp_path / "uv"
+    stand_in.write_text(
+        '#!/bin/sh\nwhile [ $# -gt 0 ]; do case $1 in --python-platform) at=$2;; --python-version) at="$at $2";; esac;'
+        f' shift; done\n[ "$at" != "{refused}" ] || {{ echo "no wheel of it"; exit 1; }}\n'
+        'echo " + one"\necho " + two"\n'
+    )
+    stand_in.chmod(0o755)
+    given = {**os.environ, "UV": str(stand_in)}
+    done = subprocess.run([ROOT / ".ci" / "platforms"], cwd=ROOT, env=given, capture_output=True, text=True)
+    lines = [line.split() for line in done.stdout.splitlines()]
+    asked = {(platform, version) for platform, version, *_ in lines if version.startswith("3.")}
+    versions = {line.rpartition(" ")[2] for line in PROJECT["classifiers"] if "Python :: 3." in line}
+    assert {version for _, version in asked} == versions
+    assert len(asked) == 4 * len(versions)
+    assert done.returncode == bool(refused)
+    assert ("no wheel of it" in done.stdout) == bool(refused)
+    assert sum(line[2:] == ["2", "packages"] for line in lines) == len(asked) - bool(refused)
 
 
 def test_long_files_of_tests_begin_first() -> None:

@@ -40,6 +40,9 @@ _ACCURACY = (
     "diameter, and the mean of such shares at thresholds from 0.05 to 0.5, as BOP takes it."
 )
 
+_SETTINGS = "Settings; lengths are shares of the diameter"
+_ORIGIN = "Where, when and of what it was made"
+
 
 @dataclass(frozen=True)
 class Result:
@@ -97,9 +100,41 @@ def beaten_by(cells: Sequence[Cell], own: str, others: Collection[str]) -> list[
     return found
 
 
+def headline(cells: Sequence[Cell], own: str, rivals: Collection[str]) -> str:
+    """Return in a sentence how much the own method and the best rival find of all objects, at the least noise.
+
+    Empty if there are no cells of the own method.
+    """
+    noise = min((cell.noise for cell in cells), default=0.0)
+    recalls = {
+        method: pooled(those, "all objects").recall()
+        for method in dict.fromkeys(cell.method for cell in cells)
+        if (those := [cell for cell in cells if (cell.method, cell.noise) == (method, noise)])
+    }
+    if own not in recalls:
+        return ""
+    count = len({cell.object for cell in cells})
+    text = f"{own} finds the right pose in {recalls[own]:.0%} of the crops of {count} object{'s' if count > 1 else ''}"
+    others = {method: recalls[method] for method in recalls if method in rivals}
+    if others:
+        best = max(others, key=lambda method: others[method])
+        text += f", the best rival, {best}, in {others[best]:.0%}"
+    return f"{text} ({noise_name(noise)})."
+
+
 def _rivals(result: Result) -> list[str]:
     """Return the keys of methods that are no form of our pipeline with the same network."""
     return [key for key, method in result.methods.items() if not isinstance(method, Ours)]
+
+
+def _rival_methods(result: Result) -> set[str]:
+    return {f"{result.methods[key].name}{refined}" for key in _rivals(result) for refined in ("", " + ICP")}
+
+
+def _headline(result: Result) -> str:
+    if OURS not in result.methods:
+        return ""
+    return headline(result.cells, f"{result.methods[OURS].name} + ICP", _rival_methods(result))
 
 
 def _sections(result: Result) -> list[tuple[str, str, list[dict[str, Any]]]]:
@@ -120,18 +155,19 @@ def _sections(result: Result) -> list[tuple[str, str, list[dict[str, Any]]]]:
     for noise in config.noise:
         sections.append((f"By object, {noise_name(noise)}", "", object_rows(cells, noise)))
     left_out = [f"{name}: {reason}" for name, reason in result.skipped.items()] + list(result.problems)
-    sections.append(("Left out", "\n".join(f"- {line}" for line in left_out) or "Nothing.", []))
+    if left_out:
+        sections.append(("Left out", "\n".join(f"- {line}" for line in left_out), []))
     settings = [
         {"method": name, "settings": json.dumps(values)} for name, values in result.recipe["methods"].items()
     ] + [{"method": "ICP of all", "settings": json.dumps(result.recipe["refinement"])}]
-    sections.append(("Settings; lengths are shares of the diameter", "", settings))
+    sections.append((_SETTINGS, "", settings))
     return sections
 
 
 def _comparisons(result: Result, own: str) -> list[tuple[str, str, list[dict[str, Any]]]]:
     """Return where rivals find more than our own, and where other forms of it do, these for all objects together."""
     cells = result.cells
-    rivals = {f"{result.methods[key].name}{refined}" for key in _rivals(result) for refined in ("", " + ICP")}
+    rivals = _rival_methods(result)
     methods = dict.fromkeys(cell.method for cell in cells)
     whole = [
         pooled([c for c in cells if c.method == method and c.noise == noise], "all objects")
@@ -143,8 +179,9 @@ def _comparisons(result: Result, own: str) -> list[tuple[str, str, list[dict[str
         ("another method", [*whole, *cells], rivals),
         ("another form of ours", whole, {*methods} - rivals - {own}),
     ):
-        text = "\n".join(f"- {line}" for line in beaten_by(compared, own, others)) or "Nowhere."
-        if others:
+        beaten = beaten_by(compared, own, others)
+        if beaten:
+            text = "\n".join(f"- {line}" for line in beaten)
             sections.append((f"Where {who} finds more than {own}", text, []))
     return sections
 
@@ -168,27 +205,32 @@ def _markdown(
     result: Result, sections: Sequence[tuple[str, str, list[dict[str, Any]]]], pictures: Mapping[str, bytes]
 ) -> str:
     parts = [f"# Evaluation: {result.config.name}"]
-    parts.append("\n".join(f"- {key}: {value}" for key, value in _facts(result).items()))
+    parts += filter(None, [_headline(result)])
     for title, text, rows in sections:
         parts += [f"## {title}", *([text] if text else []), *([markdown_table(rows)] if rows else [])]
     parts += [f"![{name}]({name}.png)" for name in pictures]
+    parts += [f"## {_ORIGIN}", "\n".join(f"- {key}: {value}" for key, value in _facts(result).items())]
     return "\n\n".join(parts) + "\n"
 
 
 def _page(
     result: Result, sections: Sequence[tuple[str, str, list[dict[str, Any]]]], pictures: Mapping[str, bytes]
 ) -> str:
-    body = [f"<h1>Evaluation: {html.escape(result.config.name)}</h1>", "<dl>"]
-    body += [f"<dt>{html.escape(key)}</dt><dd>{html.escape(value)}</dd>" for key, value in _facts(result).items()]
-    body.append("</dl>")
+    body = [f"<h1>Evaluation: {html.escape(result.config.name)}</h1>"]
+    body.append(f'<p class="headline">{html.escape(_headline(result))}</p>')
     drawn = {
         name: f'<img alt="{name}" src="data:image/png;base64,{base64.b64encode(content).decode()}">'
         for name, content in pictures.items()
     }
     for number, (title, text, rows) in enumerate(sections):
-        body += [f"<h2>{html.escape(title)}</h2>", _paragraphs(text), _table(rows)]
+        if title == _SETTINGS:
+            body += [f"<details><summary>{html.escape(title)}</summary>", _table(rows), "</details>"]
+        else:
+            body += [f"<h2>{html.escape(title)}</h2>", _paragraphs(text), _table(rows)]
         if number == 0:  # what tells most comes first
             body += drawn.values()
+    facts = [f"<dt>{html.escape(key)}</dt><dd>{html.escape(value)}</dd>" for key, value in _facts(result).items()]
+    body += [f"<details><summary>{_ORIGIN}</summary><dl>", *facts, "</dl></details>"]
     return _PAGE.replace("{title}", html.escape(result.config.name)).replace("{body}", "\n".join(body))
 
 
@@ -264,6 +306,7 @@ _PAGE = """<!doctype html>
 <title>kmn_jax evaluation: {title}</title>
 <style>
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1200px; padding: 0 1rem; color: #222; }
+.headline { font-size: 1.15rem; } summary { margin-top: 2rem; cursor: pointer; }
 h1 { font-size: 1.6rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .1rem 1rem; font-size: .85rem; }
 dt { color: #666; } dd { margin: 0; overflow-wrap: anywhere; }

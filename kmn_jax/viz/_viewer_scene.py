@@ -15,6 +15,7 @@ from jaxtyping import Float, UInt8
 from kmn_jax.detection import Detection, Scene, into, placed
 from kmn_jax.objects import Part
 from kmn_jax.viz._legend import LIKELY, NOT_THE_PART, center_of
+from kmn_jax.viz._mesh import PartMesh
 from kmn_jax.viz._shading import (
     as_bytes,
     distinct_colors,
@@ -25,7 +26,13 @@ from kmn_jax.viz._shading import (
     values_at,
 )
 
+VIEWS = {  # from which a page can look: what that is
+    "camera": "from the sensor",
+    "front": "from the side that is below in the sensor's image",
+    "top": "straight along the sensor's axis",
+}
 _FIELD_OF_VIEW = np.radians(40)
+_FRONT = np.array([0.0, 1.0, -0.3])  # towards the eye, from a little above
 _MOST_SCAN_POINTS = 300_000  # that are sent
 _MOST_HEXAGONS = 60_000  # of all poses' surfaces
 _REACH = np.radians(1.5)  # from a click, in which the nearest point of the scan has to be
@@ -46,23 +53,28 @@ class PoseNodes:
 class PageScene:
     """The scan and the poses on the page of a viser server."""
 
-    def __init__(self, server: Any, view: Scene, part: Part) -> None:
-        """Add the scan, and set the camera on the sensor's side, as near as the scan fills the page."""
+    def __init__(self, server: Any, view: Scene, part: Part, mesh: PartMesh | None = None) -> None:
+        """Add the scan, and set the camera on the sensor's side, as near as the scan fills the page.
+
+        Poses are shown by the mesh of the part, in its frame and the scan's unit, or else by pieces of its surface.
+        """
         from matplotlib import colormaps
         from matplotlib.colors import Normalize
 
         self._scene, self._view, self._part = server.scene, view, part.centred()
         self._origin = part.origin
+        self._mesh = None if mesh is None else PartMesh(mesh.vertices - part.origin, mesh.triangles)
         self._T_view_scene = np.linalg.inv(view.T_scene_camera)
         low, high = np.percentile(view.points, [1, 99], axis=0).astype(np.float64)
         self._center = (low + high) / 2
-        self._size = max(float(np.linalg.norm(high - low)), 0.5 * part.diameter)
+        self.size = max(float(np.linalg.norm(high - low)), 0.5 * part.diameter)
         self._points = self._on_page(view.points).astype(np.float32)
         self._scene.set_up_direction("-y")
         towards = -_unit(self._center)
-        width, height, depth = (high - low) / self._size
+        width, height, depth = (high - low) / self.size
         distance = depth / 2 + 0.55 * max(height, width / 1.3) / np.tan(_FIELD_OF_VIEW / 2)
-        server.initial_camera.position = towards * max(distance, 0.1)
+        self._distance = max(distance, 0.1)
+        server.initial_camera.position = towards * self._distance
         server.initial_camera.look_at = np.zeros(3)
         server.initial_camera.fov = _FIELD_OF_VIEW
         self._add_lights()
@@ -78,7 +90,7 @@ class PageScene:
         self._grey = as_bytes(np.repeat(0.25 + 0.6 * shade, 3, axis=1))
         self._by_depth = as_bytes(colors[:, :3] * (0.4 + 0.6 * shade))
         self._scan = self._add_points("/scan", self._points[rows], self._grey)
-        radius = 0.04 * part.diameter / self._size
+        radius = 0.04 * part.diameter / self.size
         self.mark = self._scene.add_icosphere("/picked", radius=radius, color=(230, 0, 120), visible=False)
 
     def show_scan(self, shown: bool, by_depth: bool) -> None:
@@ -96,20 +108,20 @@ class PageScene:
         frame = scene.add_frame(
             name,
             show_axes=False,
-            axes_length=0.5 * part.diameter / self._size,
-            axes_radius=0.012 * part.diameter / self._size,
+            axes_length=0.5 * part.diameter / self.size,
+            axes_radius=0.012 * part.diameter / self.size,
             wxyz=SO3.from_matrix(T[:3, :3]).wxyz,
             position=self._on_page(T[:3, 3]),
         )
         likely = pose.probability >= LIKELY
-        _, corners = surface_hexagons(part, int(np.clip(_MOST_HEXAGONS // count, 400, 3000)))
-        fan = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+        vertices, triangles = self._mesh or _hexagon_mesh(part, int(np.clip(_MOST_HEXAGONS // count, 400, 3000)))
         surface = scene.add_mesh_simple(
             f"{name}/surface",
-            (corners.reshape(-1, 3) / self._size).astype(np.float32),
-            (6 * np.arange(len(corners))[:, None, None] + fan).reshape(-1, 3).astype(np.uint32),
+            (vertices / self.size).astype(np.float32),
+            triangles.astype(np.uint32),
             color=tuple(int(value) for value in as_bytes(color if likely else _PALE + (1 - _PALE) * color)),
-            position=-_SURFACE_LIFT * part.diameter / self._size * _unit(T[:3, 3]) @ T[:3, :3],
+            position=-_SURFACE_LIFT * part.diameter / self.size * _unit(T[:3, 3]) @ T[:3, :3],
+            flat_shading=self._mesh is not None,
             side="double",
             cast_shadow=False,
             receive_shadow=False,
@@ -117,14 +129,14 @@ class PageScene:
         label = scene.add_label(
             f"{name}/label",
             f"{rank}: {pose.probability:.2f}",
-            position=center_of(part) / self._size,
+            position=center_of(part) / self.size,
             anchor="center-center",
         )
         prediction = pose.prediction
         on = prediction.on_object
         seen = placed(self._T_view_scene, prediction.points.astype(np.float64))
         seen -= _CROP_LIFT * part.diameter * _unit(seen)
-        points = into(T, seen) / self._size
+        points = into(T, seen) / self.size
         colors = np.where(on[:, None], color, NOT_THE_PART)
         keypoints = distinct_colors(part.num_keypoints)[prediction.keypoint[on]]
         return PoseNodes(
@@ -145,6 +157,33 @@ class PageScene:
         if row is None:
             return None
         return placed(self._view.T_scene_camera, self._view.points[row].astype(np.float64))
+
+    def eye(self, view: str) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
+        """Return where one of the `VIEWS` looks from, towards the origin, what is up there, and its vertical angle."""
+        upright = np.array([0.0, -1.0, 0.0])
+        if view == "camera":
+            camera = self._view.camera
+            angle = 2 * np.arctan(camera.height / 2 / camera.fy)
+            return -self._center / self.size, upright, float(np.clip(angle, 0.05, 2.5))
+        if view == "front":
+            return self._distance * _unit(_FRONT), np.array([0.0, 0.0, -1.0]), float(_FIELD_OF_VIEW)
+        return np.array([0.0, 0.0, -self._distance]), upright, float(_FIELD_OF_VIEW)
+
+    def in_scene(self, wxyz: Float[np.ndarray, "4"], position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+        """Return a frame of the page in the scene's frame and unit."""
+        from viser.transforms import SO3
+
+        T_view_frame = np.eye(4)
+        T_view_frame[:3, :3] = SO3(np.asarray(wxyz)).as_matrix()
+        T_view_frame[:3, 3] = np.asarray(position) * self.size + self._center
+        return self._view.T_scene_camera @ T_view_frame
+
+    def on_page(self, T_scene_frame: Float[np.ndarray, "4 4"]) -> tuple[Any, Float[np.ndarray, "3"]]:
+        """Return rotation (wxyz) and position of a frame of the scene on the page."""
+        from viser.transforms import SO3
+
+        T = self._T_view_scene @ T_scene_frame
+        return SO3.from_matrix(T[:3, :3]).wxyz, self._on_page(T[:3, 3])
 
     def show_mark(self, point: Float[np.ndarray, "3"]) -> None:
         """Mark a point of the scene's frame, in place of the one that was marked before."""
@@ -172,7 +211,14 @@ class PageScene:
 
     def _on_page(self, points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s 3"]:
         """Return points of the view's frame in the page's."""
-        return (points - self._center) / self._size
+        return (points - self._center) / self.size
+
+
+def _hexagon_mesh(part: Part, most: int) -> PartMesh:
+    """Return hexagons that cover a part of which there is no mesh."""
+    _, corners = surface_hexagons(part, most)
+    fan = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+    return PartMesh(corners.reshape(-1, 3), (6 * np.arange(len(corners))[:, None, None] + fan).reshape(-1, 3))
 
 
 def nearest_to_ray(

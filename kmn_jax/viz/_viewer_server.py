@@ -14,6 +14,7 @@ import secrets
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from http.cookies import CookieError, SimpleCookie
+from importlib.util import find_spec
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -65,13 +66,18 @@ class Door:
         return "" if found is None else found.value
 
 
+def check_page(host: str, port: int) -> None:
+    """Raise InputError if no page can be served there: the port is in use, or viser is not installed."""
+    listen(host, port).close()
+    if find_spec("viser") is None:
+        raise InputError("the page needs a package that is not installed: pip install 'viser>=1.1'")
+
+
 def start_server(host: str, port: int) -> tuple[Any, str]:
     """Return a running server, and the token of its page; viser would take another port if this one is in use."""
-    listen(host, port).close()
-    try:
-        import viser
-    except ImportError:
-        raise InputError("the page needs a package that is not installed: pip install 'kmn_jax[view]'") from None
+    check_page(host, port)
+    import viser
+
     door = Door(host)
     with contextlib.redirect_stdout(io.StringIO()), _behind(door) as used:  # our caller says where the page is
         server = viser.ViserServer(host=host, port=port, verbose=False)

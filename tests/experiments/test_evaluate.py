@@ -120,6 +120,10 @@ def test_evaluating_twice_gives_the_same_numbers_and_a_report(
     for text in (page, report):
         assert "FPFH + RANSAC + ICP" in text
         assert "kiss: no_such_rival cannot be imported" in text
+        assert "Nothing." not in text
+        assert "Nowhere." not in text
+        found = text.index("kmn_jax + ICP finds the right pose in")
+        assert found < text.index("Recall, objects: ") < text.index("Where, when and of what it was made")
 
     own = tmp_path / "one" / "ours" / f"{GEAR}.noise0.safetensors"
     stamp = own.stat().st_mtime_ns

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from experiments.evaluation.cases import Case
 from experiments.evaluation.configs import noise_name
 from experiments.evaluation.predictions import Export, Predictions
 from experiments.evaluation.published import RECALL
-from experiments.evaluation.report import beaten_by
+from experiments.evaluation.report import beaten_by, headline
 from experiments.evaluation.scores import (
     Cell,
     accuracy_rows,
@@ -132,6 +133,21 @@ def test_tables_and_where_others_find_more() -> None:
     assert [list(row) for row in by_object] == [["method", "a", "b"]] * 2
     assert by_object[1]["b"].startswith("0.91 (")
     assert pooled([cells[0], cells[2]], "all").recall() == pytest.approx(0.85)
+
+
+def test_the_headline_is_of_all_objects_without_noise() -> None:
+    cells = [cell("kmn_jax + ICP", "a", 80), cell("kmn_jax + ICP", "b", 90), cell("FPFH", "a", 60)]
+    cells += [cell("FPFH", "b", 70), cell("FPFH + ICP", "a", 70), cell("FPFH + ICP", "b", 80)]
+    cells += [replace(one, noise=0.05, errors=np.full(100, np.inf)) for one in cells]
+    rivals = {"FPFH", "FPFH + ICP"}
+    assert headline(cells, "kmn_jax + ICP", rivals) == (
+        "kmn_jax + ICP finds the right pose in 85% of the crops of 2 objects, the best rival, FPFH + ICP, in 75%"
+        " (noise 0%)."
+    )
+    assert headline(cells[:1], "kmn_jax + ICP", rivals) == (
+        "kmn_jax + ICP finds the right pose in 80% of the crops of 1 object (noise 0%)."
+    )
+    assert headline(cells, "none", rivals) == ""
 
 
 def test_methods_that_find_more_are_named_at_either_gate() -> None:

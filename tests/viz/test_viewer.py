@@ -2,150 +2,32 @@
 
 from __future__ import annotations
 
-import io
 import re
-import shutil
 import socket
 import threading
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from kmn_jax.detection import Detections, Scene
-from kmn_jax.detection._result import Timing
 from kmn_jax.errors import InputError
 from kmn_jax.viz import Viewer, distinct_colors
 from kmn_jax.viz._viewer_scene import nearest_to_ray
-from tests.detection.box_sample import FRONT, POSES, SIZES, both_boxes, box_part, box_view, detection
-from tests.reference.meshes import pose, random_rotations
-
-T_SCENE_CAMERA = pose((5.0, -2.0, 1.0), random_rotations(1, 3)[0])
-PART = box_part()
-
-
-def moved(view: Scene, found: Detections) -> tuple[Scene, Detections]:
-    """Return the sample in a scene whose frame is not the sensor's."""
-
-    def into_scene(points: np.ndarray) -> np.ndarray:
-        return points @ T_SCENE_CAMERA[:3, :3].T + T_SCENE_CAMERA[:3, 3]
-
-    poses = [
-        replace(
-            one,
-            T_scene_object=T_SCENE_CAMERA @ one.T_scene_object,
-            seed=into_scene(one.seed),
-            prediction=replace(one.prediction, points=into_scene(one.prediction.points).astype(np.float32)),
-        )
-        for one in found.poses
-    ]
-    return replace(view, T_scene_camera=T_SCENE_CAMERA), replace(found, poses=tuple(poses))
-
-
-@dataclass
-class Picker:
-    """Answers searches with the right box alone, or with an error, once it may."""
-
-    answer: Detections | Exception
-    places: list[np.ndarray] = field(default_factory=list)
-    may_answer: threading.Event = field(default_factory=threading.Event)
-
-    def __call__(self, place: np.ndarray) -> Detections:
-        self.places.append(place)
-        assert self.may_answer.wait(30)
-        if isinstance(self.answer, Exception):
-            raise self.answer
-        return self.answer
-
-
-@pytest.fixture(scope="module")
-def sample() -> tuple[Scene, Detections]:
-    view = box_view()
-    return moved(view, both_boxes(PART, view))
-
-
-@pytest.fixture(scope="module")
-def picked() -> Detections:
-    view = box_view()
-    found = Detections("box", "m", (detection(PART, view, POSES[1], 0.67),), Timing({"search": 0.1}, 0.0))
-    return moved(view, found)[1]
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    chromium = shutil.which("chromium")
-    driver = shutil.which("chromedriver")
-    if chromium is None or driver is None:
-        pytest.skip("chromium or its driver is not installed: apt-get install chromium chromium-driver")
-    from selenium import webdriver
-    from selenium.webdriver.chrome.service import Service
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = chromium
-    flags = ["headless", "no-sandbox", "disable-gpu", "disable-quic", "no-first-run", "disable-background-networking"]
-    flags += ["disable-component-update", "disable-sync", "disable-dev-shm-usage", "window-size=1000,640"]
-    flags += ["use-angle=swiftshader", "enable-unsafe-swiftshader"]
-    # The page must not need any other machine.
-    flags += ["host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]
-    flags += [f"user-data-dir={tmp_path_factory.mktemp('chromium')}"]
-    for flag in flags:
-        options.add_argument(f"--{flag}")
-    # A spare connection, opened ahead of need, would hold the server up for seconds when it stops.
-    options.add_experimental_option("prefs", {"net.network_prediction_options": 2})
-    driven = webdriver.Chrome(options, Service(driver))
-    try:
-        yield driven
-    finally:
-        driven.quit()
-
-
-def eventually(condition: Callable[[], object], seconds: float = 40.0) -> None:
-    """Wait until a condition holds; fail if it does not."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it has not come true"
-        time.sleep(0.05)
-
-
-def look_at(browser: Any, page: Viewer) -> None:
-    """Open the page and wait for what is in it."""
-    browser.get(f"{page.url}")
-    eventually(lambda: "2 poses, 1 of them likely" in text(browser))
-
-
-def text(browser: Any) -> str:
-    return str(browser.find_element("tag name", "body").text)
-
-
-def click(browser: Any, label: str) -> None:
-    """Click on what is labelled so: the checkbox beside the label, or a button."""
-    checkbox = f"//label[normalize-space()='{label}']/ancestor::*[.//input[@type='checkbox']][1]//input"
-    found = browser.find_elements("xpath", checkbox) or browser.find_elements(
-        "xpath", f"//button[normalize-space()='{label}']"
-    )
-    browser.execute_script("arguments[0].click()", found[0])
-
-
-def click_on_canvas(browser: Any, right: int, down: int) -> None:
-    """Click on the scene, so many pixels from its centre."""
-    from selenium.webdriver import ActionChains
-
-    canvas = browser.find_element("tag name", "canvas")
-    ActionChains(browser).move_to_element_with_offset(canvas, right, down).click().perform()
-
-
-def count_like(browser: Any, color: np.ndarray) -> int:
-    """Return how many pixels of the page's scene have a colour, whatever their brightness."""
-    image = np.asarray(Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")).astype(float)
-    canvas = image[:, : browser.find_element("tag name", "canvas").size["width"]]
-    vivid = np.ptp(canvas, axis=2) > 60
-    cosine = canvas @ color / np.maximum(np.linalg.norm(canvas, axis=2) * np.linalg.norm(color), 1e-9)
-    return int((vivid & (cosine > 0.985)).sum())
+from tests.detection.box_sample import FRONT, POSES, SIZES
+from tests.viz.page_sample import (
+    PART,
+    T_SCENE_CAMERA,
+    Picker,
+    click,
+    click_on_canvas,
+    count_like,
+    eventually,
+    look_at,
+    text,
+)
 
 
 def test_the_page_shows_the_poses_and_switches_them(browser: Any, sample: tuple[Scene, Detections]) -> None:
@@ -210,10 +92,18 @@ def test_a_click_on_the_scan_searches_there(browser: Any, sample: tuple[Scene, D
         assert in_view[2] < FRONT + 0.01
         search.may_answer.set()
         eventually(lambda: "probability 0.67" in text(browser))
-        assert "probability 0.93" not in text(browser)
-        assert page.found is picked
-        click(browser, "Show the first result again")
-        eventually(lambda: "probability 0.93" in text(browser))
+        assert "probability 0.93" in text(browser)  # it comes to the others
+        assert page.found.poses == (*found.poses, *picked.poses)
+        assert page.chosen is None  # the click was for the scan, not for the pose in front of it
+        assert page.is_shown(3, "Surfaces")
+
+        click(browser, "Pick a point to search at")
+        eventually(lambda: "Click on a point of the scan." in text(browser))
+        click_on_canvas(browser, right, 0)
+        eventually(lambda: "That is pose 3." in text(browser))
+        assert len(page.found.poses) == 3
+        click(browser, "Remove picked poses")
+        eventually(lambda: "probability 0.67" not in text(browser))
         assert page.found is found
 
 
