@@ -1,6 +1,6 @@
 """Kill commands at random moments, start them again, and see that nothing is lost and the results are the same.
 
-python -m tests.attack.kills --kills 200 --seed 0 --json FILE [--only training]
+python -m tests.attack.kills --kills 200 --seed 0 --json FILE [--only training] [--resume]
 
 Each command first runs without a stop. Then it is killed (SIGKILL) a few times, at its start or while it writes, alone
 or with the processes that it has started; after each kill what it left is looked at, at last it ends and is compared.
@@ -9,6 +9,7 @@ or with the processes that it has started; after each kill what it left is looke
 from __future__ import annotations
 
 import contextlib
+import json as json_format
 import os
 import signal
 import subprocess
@@ -47,40 +48,55 @@ class Tally:
     faults: list[str] = field(default_factory=list)
     leftovers: int = 0  # hidden files that lie there when a run has finished
     seconds: float = 0.0  # of the run without a stop
+    duration: float = 0.0  # s, of all
+    commit: str | None = None
 
 
-def main(kills: int = 200, seed: int = 0, json: Path | None = None, only: str = "") -> int:
+def main(kills: int = 200, seed: int = 0, json: Path | None = None, only: str = "", resume: bool = False) -> int:
     """Kill, and return 1 if anything was lost or differs.
 
     Args:
         kills: how many, shared by all activities.
         seed: number that the moments follow from, as far as clocks allow.
-        json: where counts and faults go.
+        json: where counts and faults go, after each activity.
         only: name of one activity; the others are left out.
+        resume: keep what is in that file of activities that were killed as often from the same seed without a fault.
     """
     chosen = {name: activity for name, activity in ACTIVITIES.items() if only in ("", name)}
     if not chosen:
         raise InputError(f"there is no activity {only!r}: there are {', '.join(ACTIVITIES)}")
     check_target(json)
-    start, tallies = time.perf_counter(), []
+    done = _without_faults(json, seed) if resume and json is not None else {}
     with tqdm(total=kills, unit="kill") as bar:
         for row, (name, activity) in enumerate(chosen.items()):
             share = kills // len(chosen) + (row < kills % len(chosen))
-            tallies.append(killed(name, activity, share, Random(f"{seed} {name}"), bar))
-    rows = [asdict(tally) | {"faults": len(tally.faults)} for tally in tallies]
-    print_table(f"{sum(tally.kills for tally in tallies)} kills, seed {seed}", rows)
+            if name in done and done[name].kills == share:
+                bar.update(share)
+            else:
+                done[name] = killed(name, activity, share, Random(f"{seed} {name}"), bar)
+            tallies = list(done.values())
+            sums = {"kills": sum(one.kills for one in tallies), "faults": sum(len(one.faults) for one in tallies)}
+            machine = {"processor": processor(), "cores": os.cpu_count()}
+            write_json(json, {**sums, "activities": list(map(asdict, tallies)), "seed": seed, **machine})
+    print_table(f"{sums['kills']} kills, seed {seed}", [asdict(one) | {"faults": len(one.faults)} for one in tallies])
     for tally in tallies:
         for fault in tally.faults:
             print(f"{tally.activity}: {fault}")
-    seconds = round(time.perf_counter() - start)
-    machine = {"processor": processor(), "cores": os.cpu_count(), "commit": commit()}
-    write_json(json, {"activities": list(map(asdict, tallies)), "seed": seed, "seconds": seconds, **machine})
-    return int(any(tally.faults for tally in tallies))
+    return int(sums["faults"] > 0)
+
+
+def _without_faults(path: Path, seed: int) -> dict[str, Tally]:
+    """Return what an earlier run, from the same seed, has written of activities in which nothing was lost."""
+    if not path.exists():
+        return {}
+    found = json_format.loads(path.read_text(encoding="utf-8"))
+    tallies = [Tally(**row) for row in found["activities"] if found["seed"] == seed]
+    return {tally.activity: tally for tally in tallies if not tally.faults}
 
 
 def killed(name: str, activity: Activity, kills: int, random: Random, bar: Any = None) -> Tally:
     """Kill runs of an activity so many times, and let each of them end after a few kills."""
-    tally = Tally(name)
+    tally, begin = Tally(name, commit=commit()), time.monotonic()
     with tempfile.TemporaryDirectory(prefix="kills-") as place:
         whole = Path(place, "whole")
         whole.mkdir()
@@ -106,6 +122,7 @@ def killed(name: str, activity: Activity, kills: int, random: Random, bar: Any =
             _note(tally, f"run {number}, at its end", activity.same, folder, whole)
             tally.finished += 1
             tally.leftovers += sum(path.name.startswith(".") for path in folder.rglob("*"))
+    tally.duration = round(time.monotonic() - begin, 1)
     return tally
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +11,8 @@ from random import Random
 import pytest
 
 from kmn_jax.errors import InputError
-from tests.attack.activities import ACTIVITIES
+from tests.attack import kills
+from tests.attack.activities import ACTIVITIES, Activity
 from tests.attack.kills import killed, main
 
 # Writes ten lines with pauses: each whole in a file of its own, or into one file that a restart begins anew.
@@ -78,6 +80,25 @@ def test_activities_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(ACTIVITIES) >= {"training", "pack building", "prepare", "evaluation"}
     with pytest.raises(InputError, match="there is no activity 'cooking'"):
         main(only="cooking")
+
+
+def test_activities_without_faults_are_not_killed_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    activities: dict[str, Activity] = {"first": Writing(TORN), "second": Writing(WHOLE)}
+    monkeypatch.setattr(kills, "ACTIVITIES", activities)
+    path, killed_now = tmp_path / "kills.json", []
+
+    def recorded(name: str, *_: object) -> kills.Tally:
+        killed_now.append(name)
+        return kills.Tally(name, kills=2, faults=["torn"] if name == "first" and len(killed_now) < 3 else [])
+
+    monkeypatch.setattr(kills, "killed", recorded)
+    assert main(4, 0, path) == 1
+    assert main(4, 0, path, resume=True) == 0
+    assert killed_now == ["first", "second", "first"]
+    found = json.loads(path.read_text())
+    assert (found["kills"], found["faults"]) == (4, 0)
+    assert main(4, 1, path, resume=True) == 0  # another seed, other moments
+    assert killed_now[3:] == ["first", "second"]
 
 
 @pytest.mark.parametrize("name", ACTIVITIES)
