@@ -77,7 +77,7 @@ def test_a_command_that_cannot_go_on_is_a_fault() -> None:
 
 
 def test_activities_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert set(ACTIVITIES) >= {"training", "pack building", "prepare", "evaluation"}
+    assert set(ACTIVITIES) >= {"training", "pack building", "prepare", "evaluation", "serve"}
     with pytest.raises(InputError, match="there is no activity 'cooking'"):
         main(only="cooking")
 
