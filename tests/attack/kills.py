@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from random import Random
@@ -26,7 +26,7 @@ import tyro
 from tqdm import tqdm
 
 from kmn_jax.errors import InputError
-from kmn_jax.report import check_target, commit, print_table, processor, write_json
+from kmn_jax.report import check_target, commit, print_table, write_json
 from tests.attack.activities import ACTIVITIES, Activity
 from tests.train.loop_sample import ENVIRONMENT, ONE_DEVICE
 
@@ -48,7 +48,8 @@ class Tally:
     faults: list[str] = field(default_factory=list)
     leftovers: int = 0  # hidden files that lie there when a run has finished
     seconds: float = 0.0  # of the run without a stop
-    duration: float = 0.0  # s, of all
+    writing: float = 0.0  # s of these from what it writes first
+    duration: float = 0.0  # s of all killed runs, until they ended
     commit: str | None = None
 
 
@@ -58,31 +59,25 @@ def main(kills: int = 200, seed: int = 0, json: Path | None = None, only: str = 
     Args:
         kills: how many, shared by all activities.
         seed: number that the moments follow from, as far as clocks allow.
-        json: where counts and faults go, after each activity.
+        json: where counts and faults go, after each run that was killed and has ended.
         only: name of one activity; the others are left out.
-        resume: keep what is in that file of activities that were killed as often from the same seed without a fault.
+        resume: go on with what that file has of activities without a fault, if it is from the same seed.
     """
     chosen = {name: activity for name, activity in ACTIVITIES.items() if only in ("", name)}
     if not chosen:
         raise InputError(f"there is no activity {only!r}: there are {', '.join(ACTIVITIES)}")
     check_target(json)
-    done = _without_faults(json, seed) if resume and json is not None else {}
+    tallies = _without_faults(json, seed) if resume and json is not None else {}
+    shares = {name: kills // len(chosen) + (row < kills % len(chosen)) for row, name in enumerate(chosen)}
     with tqdm(total=kills, unit="kill") as bar:
-        for row, (name, activity) in enumerate(chosen.items()):
-            share = kills // len(chosen) + (row < kills % len(chosen))
-            if name in done and done[name].kills == share:
-                bar.update(share)
-            else:
-                done[name] = killed(name, activity, share, Random(f"{seed} {name}"), bar)
-            tallies = list(done.values())
-            sums = {"kills": sum(one.kills for one in tallies), "faults": sum(len(one.faults) for one in tallies)}
-            machine = {"processor": processor(), "cores": os.cpu_count()}
-            write_json(json, {**sums, "activities": list(map(asdict, tallies)), "seed": seed, **machine})
-    print_table(f"{sums['kills']} kills, seed {seed}", [asdict(one) | {"faults": len(one.faults)} for one in tallies])
-    for tally in tallies:
+        kill_all(chosen, shares, seed, tallies, bar, lambda: _write(json, tallies, seed))
+    _write(json, tallies, seed)
+    rows = [asdict(one) | {"faults": len(one.faults)} for one in tallies.values()]
+    print_table(f"{sum(one.kills for one in tallies.values())} kills, seed {seed}", rows)
+    for tally in tallies.values():
         for fault in tally.faults:
             print(f"{tally.activity}: {fault}")
-    return int(sums["faults"] > 0)
+    return int(any(tally.faults for tally in tallies.values()))
 
 
 def _without_faults(path: Path, seed: int) -> dict[str, Tally]:
@@ -94,36 +89,70 @@ def _without_faults(path: Path, seed: int) -> dict[str, Tally]:
     return {tally.activity: tally for tally in tallies if not tally.faults}
 
 
-def killed(name: str, activity: Activity, kills: int, random: Random, bar: Any = None) -> Tally:
-    """Kill runs of an activity so many times, and let each of them end after a few kills."""
-    tally, begin = Tally(name, commit=commit()), time.monotonic()
+def _write(path: Path | None, tallies: dict[str, Tally], seed: int) -> None:
+    rows = sorted(map(asdict, tallies.values()), key=lambda row: list(ACTIVITIES).index(row["activity"]))
+    sums = {"kills": sum(row["kills"] for row in rows), "faults": sum(len(row["faults"]) for row in rows)}
+    write_json(path, {**sums, "activities": rows, "seed": seed})
+
+
+def kill_all(
+    activities: dict[str, Activity],
+    shares: dict[str, int],
+    seed: int,
+    tallies: dict[str, Tally],
+    bar: Any = None,
+    save: Callable[[], None] = lambda: None,
+) -> None:
+    """Kill runs of activities, one in turn, until each has been killed as often as its share says."""
     with tempfile.TemporaryDirectory(prefix="kills-") as place:
-        whole = Path(place, "whole")
-        whole.mkdir()
+        trials = []
+        for number, (name, activity) in enumerate(activities.items()):
+            tally = tallies.setdefault(name, Tally(name, commit=commit()))
+            if bar is not None:
+                bar.update(min(tally.kills, shares[name]))
+            if tally.kills < shares[name]:
+                trials.append(Trial(activity, Path(place, str(number)), tally))
+        while left := [trial for trial in trials if trial.tally.kills < shares[trial.tally.activity]]:
+            for trial in left:
+                trial.run(shares[trial.tally.activity], seed, bar)
+                save()
+
+
+class Trial:
+    """An activity that is killed, how it ends without, and what comes of it."""
+
+    def __init__(self, activity: Activity, place: Path, tally: Tally) -> None:
+        """Let the activity end without a stop."""
+        self.activity, self.place, self.tally = activity, place, tally
+        self.whole = place / "whole"
+        self.whole.mkdir(parents=True)
         start = time.monotonic()
-        _finish(activity, whole)
+        _finish(activity, self.whole)
         tally.seconds = round(time.monotonic() - start, 1)
-        writes = _seconds_of_writing(activity, Path(place, "again"))
-        number = 0
-        while tally.kills < kills:
-            folder = Path(place, str(number))
-            folder.mkdir()
-            number += 1
-            for _ in range(min(random.randint(1, _MOST_IN_A_ROW), kills - tally.kills)):
-                _kill(activity, folder, writes, random, tally)
-                if bar is not None:
-                    bar.update()
-                _note(tally, f"run {number}, kill {tally.kills}", activity.intact, folder, whole)
-            try:
-                _finish(activity, folder)
-            except RuntimeError as error:
-                tally.faults.append(f"run {number}, after kill {tally.kills}: {error}")
-                continue
-            _note(tally, f"run {number}, at its end", activity.same, folder, whole)
+        if not tally.writing:
+            tally.writing = round(_seconds_of_writing(activity, place / "again"), 3)
+
+    def run(self, most: int, seed: int, bar: Any = None) -> None:
+        """Kill one run a few times, until there are `most` kills; then let it end, and compare."""
+        tally, start = self.tally, time.monotonic()
+        random = Random(f"{seed} {tally.activity} {tally.kills}")
+        when = f"run from kill {tally.kills} on"
+        folder = self.place / str(tally.kills)
+        folder.mkdir()
+        for _ in range(min(random.randint(1, _MOST_IN_A_ROW), most - tally.kills)):
+            _kill(self.activity, folder, tally.writing, random, tally)
+            if bar is not None:
+                bar.update()
+            _note(tally, f"{when}, kill {tally.kills}", self.activity.intact, folder, self.whole)
+        try:
+            _finish(self.activity, folder)
+        except RuntimeError as error:
+            tally.faults.append(f"{when}, after kill {tally.kills}: {error}")
+        else:
+            _note(tally, f"{when}, at its end", self.activity.same, folder, self.whole)
             tally.finished += 1
             tally.leftovers += sum(path.name.startswith(".") for path in folder.rglob("*"))
-    tally.duration = round(time.monotonic() - begin, 1)
-    return tally
+        tally.duration = round(tally.duration + time.monotonic() - start, 1)
 
 
 def _note(tally: Tally, when: str, check: Any, folder: Path, whole: Path) -> None:

@@ -6,14 +6,13 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from random import Random
 
 import pytest
 
 from kmn_jax.errors import InputError
 from tests.attack import kills
 from tests.attack.activities import ACTIVITIES, Activity
-from tests.attack.kills import killed, main
+from tests.attack.kills import Tally, Trial, kill_all, main
 
 # Writes ten lines with pauses: each whole in a file of its own, or into one file that a restart begins anew.
 WHOLE = """
@@ -56,22 +55,28 @@ class Writing:
         assert contents[0] == contents[1], "the end differs"
 
 
+def killed(activity: Activity, kills: int) -> Tally:
+    tallies: dict[str, Tally] = {}
+    kill_all({"one": activity}, {"one": kills}, 0, tallies)
+    return tallies["one"]
+
+
 def test_what_is_written_whole_survives() -> None:
-    tally = killed("whole", Writing(WHOLE), 6, Random(0))
+    tally = killed(Writing(WHOLE), 6)
     assert (tally.kills, tally.faults) == (6, [])
     assert 0 < tally.finished <= 6
     assert tally.too_late < 6
 
 
 def test_what_is_torn_is_found() -> None:
-    tally = killed("torn", Writing(TORN), 6, Random(0))
+    tally = killed(Writing(TORN), 6)
     assert any("all.txt is torn" in fault for fault in tally.faults)
     assert any("the end differs" in fault for fault in tally.faults)
 
 
 def test_a_command_that_cannot_go_on_is_a_fault() -> None:
     program = "import os, sys\nos.mkdir(sys.argv[1] + '/a')\nimport time\ntime.sleep(0.3)"
-    tally = killed("stuck", Writing(program), 2, Random(1))
+    tally = killed(Writing(program), 2)
     assert tally.finished == 0
     assert any("it ended with code 1" in fault and "FileExistsError" in fault for fault in tally.faults)
 
@@ -82,23 +87,34 @@ def test_activities_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
         main(only="cooking")
 
 
-def test_activities_without_faults_are_not_killed_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    activities: dict[str, Activity] = {"first": Writing(TORN), "second": Writing(WHOLE)}
-    monkeypatch.setattr(kills, "ACTIVITIES", activities)
-    path, killed_now = tmp_path / "kills.json", []
+def test_what_was_killed_without_a_fault_is_not_killed_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kills, "ACTIVITIES", {"first": Writing(TORN), "second": Writing(WHOLE)})
+    path, turns = tmp_path / "kills.json", list[str]()
 
-    def recorded(name: str, *_: object) -> kills.Tally:
-        killed_now.append(name)
-        return kills.Tally(name, kills=2, faults=["torn"] if name == "first" and len(killed_now) < 3 else [])
+    class Known(Trial):
+        def __init__(self, activity: Activity, place: Path, tally: Tally) -> None:
+            self.tally = tally
 
-    monkeypatch.setattr(kills, "killed", recorded)
+        def run(self, most: int, seed: int, bar: object = None) -> None:
+            if len(turns) == 6:
+                raise KeyboardInterrupt
+            turns.append(self.tally.activity)
+            self.tally.kills += 1
+            if len(turns) == 1:
+                self.tally.faults.append("torn")
+
+    monkeypatch.setattr(kills, "Trial", Known)
     assert main(4, 0, path) == 1
-    assert main(4, 0, path, resume=True) == 0
-    assert killed_now == ["first", "second", "first"]
+    with pytest.raises(KeyboardInterrupt):
+        main(6, 0, path, resume=True)
+    assert turns == ["first", "second", "first", "second", "first", "second"]
+    turns[:] = ["no fault"]
+    assert main(6, 0, path, resume=True) == 0
+    assert turns[1:] == ["first", "first"]
     found = json.loads(path.read_text())
-    assert (found["kills"], found["faults"]) == (4, 0)
-    assert main(4, 1, path, resume=True) == 0  # another seed, other moments
-    assert killed_now[3:] == ["first", "second"]
+    assert (found["kills"], found["faults"], found["seed"]) == (6, 0, 0)
+    main(2, 1, path, resume=True)  # another seed, other moments
+    assert turns[3:] == ["first", "second"]
 
 
 @pytest.mark.parametrize("name", ACTIVITIES)
