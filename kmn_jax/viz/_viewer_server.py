@@ -18,6 +18,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from kmn_jax.errors import InputError
+from kmn_jax.extras import install_command
 from kmn_jax.web import is_allowed_host, is_same_origin, listen
 
 _MOST_BYTES = 1_000_000  # of a message; the page's own are small
@@ -71,7 +72,7 @@ def start_server(host: str, port: int) -> tuple[Any, str]:
     try:
         import viser
     except ImportError:
-        raise InputError("the page needs a package that is not installed: pip install 'kmn_jax[view]'") from None
+        raise InputError(f"the page needs packages that are not installed: {install_command('viser')}") from None
     door = Door(host)
     with contextlib.redirect_stdout(io.StringIO()), _behind(door) as used:  # our caller says where the page is
         server = viser.ViserServer(host=host, port=port, verbose=False)
