@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 import sys
 import traceback
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ import tyro
 from kmn_jax import __version__
 from kmn_jax.arguments import joined, parsed
 from kmn_jax.errors import InputError, number_list, require
-from kmn_jax.extras import missing_packages
+from kmn_jax.extras import install_command
 from kmn_jax.files import check_output, write_whole
 
 if TYPE_CHECKING:
@@ -373,8 +372,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"kmn: {error}", file=sys.stderr)
         return 2
     except ModuleNotFoundError as error:
-        wanted = " ".join(shlex.quote(package) for package in missing_packages(error.name or "kmn_jax"))
-        print(f"kmn: this needs packages that are not installed: pip install {wanted}", file=sys.stderr)
+        wanted = install_command(error.name or "kmn_jax")
+        print(f"kmn: this needs packages that are not installed: {wanted}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130

@@ -7,6 +7,8 @@ inside of a trace has.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -45,6 +47,29 @@ def number_list(text: str, name: str, *counts: int) -> list[float]:
         allowed = " or ".join(map(str, counts))
         raise InputError(f"{name} is {text!r}, but must be {allowed} numbers with commas between them")
     return values
+
+
+def finite_numbers(value: object, name: str, count: int) -> np.ndarray:
+    """Return so many finite numbers that a file of JSON holds, in double precision, or raise InputError."""
+    try:
+        numbers = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        numbers = np.zeros(0)
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise InputError(f"{name} must be {count} finite numbers")
+    return numbers
+
+
+def known_fields(value: object, name: str, known: set[str]) -> dict[str, Any]:
+    """Return an object of JSON, or raise InputError if it is none or has a field that is not known."""
+    if not isinstance(value, dict):
+        raise InputError(f"{name} must be an object with {', '.join(sorted(known))}")
+    unknown = sorted(value.keys() - known)
+    if unknown:
+        raise InputError(
+            f"{name} has {shown(repr(unknown[0]))}, which is not known: it may have {', '.join(sorted(known))}"
+        )
+    return value
 
 
 def is_traced(value: object) -> bool:

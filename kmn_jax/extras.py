@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, requires, version
 
@@ -28,6 +29,11 @@ def missing_packages(module: str, lines: Iterable[str] | None = None) -> tuple[s
     if package not in wanted:  # of none of them: somebody else's
         return (package,)
     return tuple(f"{name}{bounds}" for name, bounds in sorted(wanted.items()) if name == package or not _is_there(name))
+
+
+def install_command(module: str) -> str:
+    """Return the command that installs what is missing when a module is."""
+    return f"pip install {' '.join(shlex.quote(package) for package in missing_packages(module))}"
 
 
 def _requirements() -> Iterable[str]:

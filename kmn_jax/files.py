@@ -23,7 +23,7 @@ from kmn_jax.limits import parse_json
 if sys.platform != "win32":
     import fcntl
 
-_SECONDS_TO_LOCK = 2.0  # that a process may take from making a file to locking it
+SECONDS_TO_LOCK = 2.0  # that a process may take from making a file to locking it
 
 
 def write_whole(path: str | Path, content: bytes) -> None:
@@ -45,7 +45,7 @@ def write_whole(path: str | Path, content: bytes) -> None:
         temporary = target.with_name(f".{target.name[:100]}.{secrets.token_hex(8)}")
         try:
             with temporary.open("xb") as file:  # under the user's umask
-                _lock(file)
+                lock(file)
                 if mode is not None:
                     temporary.chmod(stat.S_IMODE(mode))
                 file.write(content)
@@ -64,14 +64,14 @@ def _remove_left_over(target: Path) -> None:
         with os.scandir(target.parent) as entries:
             left = [entry for entry in entries if name.fullmatch(entry.name) and entry.is_file(follow_symlinks=False)]
         for entry in left:
-            if time.time() - entry.stat(follow_symlinks=False).st_mtime > _SECONDS_TO_LOCK:
+            if time.time() - entry.stat(follow_symlinks=False).st_mtime > SECONDS_TO_LOCK:
                 with open(entry.path, "rb") as file:
-                    if _lock(file):
+                    if lock(file):
                         os.unlink(entry.path)
 
 
-def _lock(file: BinaryIO) -> bool:
-    """Lock a file until it is closed or its process ends, and tell whether it worked."""
+def lock(file: BinaryIO | int) -> bool:
+    """Lock a file, or a folder by its handle, until it is closed or its process ends; tell whether it worked."""
     if sys.platform == "win32":
         return False
     try:

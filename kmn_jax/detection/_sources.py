@@ -48,6 +48,8 @@ def arranged(
     scan: ScanSource, K: CameraMatrix | None, depth_unit: str | float | None, camera: object, unit: str | None
 ) -> ScanSource:
     """Return arrays as scans or points (n, 3). Raises InputError for arguments that contradict each other."""
+    if isinstance(scan, Scan) and (camera is not None or unit not in (None, "auto", scan.unit)):
+        raise InputError(f"a Scan has its own camera and unit, here {scan.unit}: leave camera and unit out")
     if hasattr(scan, "__array__"):
         scan = np.asarray(scan)  # of JAX, perhaps
     if K is None and depth_unit is None:

@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 
 from kmn_jax.errors import InputError
+from kmn_jax.extras import install_command
 from kmn_jax.limits import check_bytes, most_bytes
 
 _SECONDS = 300  # files take one or two
@@ -35,7 +36,7 @@ def decoded_apart(content: bytes, program: str, package: str, *arguments: str) -
     than the budget allows, or if the package that it needs is not installed.
     """
     if importlib.util.find_spec(package) is None:
-        raise InputError("such files need a reader that is not installed: pip install 'kmn_jax[data]'")
+        raise InputError(f"such files need packages that are not installed: {install_command(package)}")
     most = most_bytes()
     limits = _LIMITS.format(seconds=int(_SECONDS) + 60, memory=most + most // 2 + _OWN_BYTES, size=most)
     try:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from kmn_jax.errors import InputError, shown
+from kmn_jax.errors import InputError, finite_numbers, known_fields, shown
 from kmn_jax.io import in_other_unit, pose_of, read_file
 from kmn_jax.limits import parse_json
 from kmn_jax.units import METRES, check_unit
@@ -87,7 +87,7 @@ def load_grasps(path: str | Path) -> Grasps:
     content = read_file(path, "a file of grasps")
     try:
         found = parse_json(content.decode("utf-8"))
-        return _grasps(_object(found, "the file", {"unit", "gripper", "grasps"}))
+        return _grasps(known_fields(found, "the file", {"unit", "gripper", "grasps"}))
     except ValueError as error:  # InputError is one
         raise InputError(f"{path} cannot be used as grasps: {shown(error)}") from None
 
@@ -95,16 +95,16 @@ def load_grasps(path: str | Path) -> Grasps:
 def _grasps(found: Mapping[str, Any]) -> Grasps:
     if "unit" not in found:
         raise InputError('it has no unit: say which its lengths are in, such as "unit": "mm"')
-    own = _object(found.get("gripper"), "gripper", {"boxes", "fingers", "approach"})
+    own = known_fields(found.get("gripper"), "gripper", {"boxes", "fingers", "approach"})
     boxes = [
-        _object(box, f"box {number} of the gripper", {"center", "size"})
+        known_fields(box, f"box {number} of the gripper", {"center", "size"})
         for number, box in enumerate(_list(own.get("boxes", []), "boxes of the gripper"), start=1)
     ]
     centers = [_numbers(box.get("center"), "center of a box") for box in boxes]
     sizes = [_numbers(box.get("size"), "size of a box", above_zero=True) for box in boxes]
     finger, reach = None, 0.0
     if "fingers" in own:
-        fingers = _object(own["fingers"], "fingers", {"size", "reach"})
+        fingers = known_fields(own["fingers"], "fingers", {"size", "reach"})
         finger = _numbers(fingers.get("size"), "size of the fingers", above_zero=True)
         reach = _number(fingers.get("reach", 0), "reach of the fingers", -np.inf)
     if not boxes and finger is None:
@@ -118,7 +118,7 @@ def _grasps(found: Mapping[str, Any]) -> Grasps:
     )
     grasps = []
     for number, value in enumerate(_list(found.get("grasps"), "grasps"), start=1):
-        one = _object(value, f"grasp {number}", {"name", "width", "T_object_grasp", "xyz", "xyzw"})
+        one = known_fields(value, f"grasp {number}", {"name", "width", "T_object_grasp", "xyz", "xyzw"})
         width = _number(one.get("width", 0), f"width of grasp {number}", 0.0)
         try:
             pose = pose_of(one, "T_object_grasp")
@@ -130,17 +130,6 @@ def _grasps(found: Mapping[str, Any]) -> Grasps:
     return Grasps(check_unit(str(found["unit"])), gripper, tuple(grasps))
 
 
-def _object(value: Any, name: str, known: set[str]) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise InputError(f"{name} must be an object with {', '.join(sorted(known))}")
-    unknown = sorted(value.keys() - known)
-    if unknown:
-        raise InputError(
-            f"{name} has {shown(repr(unknown[0]))}, which is not known: it may have {', '.join(sorted(known))}"
-        )
-    return value
-
-
 def _list(value: Any, name: str) -> list[Any]:
     if not isinstance(value, list):
         raise InputError(f"{name} must be a list")
@@ -148,12 +137,9 @@ def _list(value: Any, name: str) -> list[Any]:
 
 
 def _numbers(value: Any, name: str, above_zero: bool = False) -> Float[np.ndarray, "3"]:
-    try:
-        numbers = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        numbers = np.zeros(0)
-    if numbers.shape != (3,) or not np.isfinite(numbers).all() or (above_zero and not (numbers > 0).all()):
-        raise InputError(f"the {name} must be three numbers{' above zero' if above_zero else ''}, x, y and z")
+    numbers = finite_numbers(value, f"the {name}", 3)
+    if above_zero and not (numbers > 0).all():
+        raise InputError(f"the {name} must be 3 numbers above zero, x, y and z")
     return numbers
 
 

@@ -128,11 +128,11 @@ def _form(fields: Mapping[str, Any], files: Mapping[str, tuple[str, bytes]]) -> 
 def _request(
     server: str, path: str, body: bytes | None = None, headers: Mapping[str, str] | None = None
 ) -> tuple[bytes, http.client.HTTPMessage]:
-    """Return content and headers of an answer. Redirects are followed, proxies are not used."""
+    """Return content and headers of an answer. Redirects are not followed, proxies not used."""
     if urllib.parse.urlsplit(server).scheme not in ("http", "https"):
         raise InputError(f"{server} is no address of a server: it begins with http:// or https://")
     request = urllib.request.Request(server.rstrip("/") + path, body, dict(headers or {}))
-    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}), _NoRedirects)
     try:
         with opener.open(request, timeout=_SECONDS) as answer:
             return answer.read(), answer.headers
@@ -145,6 +145,13 @@ def _request(
     except (OSError, ValueError, http.client.HTTPException) as error:
         reason = getattr(error, "reason", error)
         raise InputError(f"no answer from a server at {server} ({reason}): start one with kmn serve") from None
+
+
+class _NoRedirects(urllib.request.HTTPRedirectHandler):
+    """Takes a redirect for an error: scans go to the address that was named alone."""
+
+    def redirect_request(self, *_: Any) -> None:
+        """Return no other request."""
 
 
 def _detections(result: Mapping[str, Any], part: str) -> Detections:

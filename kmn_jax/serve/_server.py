@@ -19,6 +19,7 @@ from kmn_jax.detection import PoseEstimator
 from kmn_jax.errors import InputError, require
 from kmn_jax.io import MESH_SUFFIXES, Scan
 from kmn_jax.objects import Part
+from kmn_jax.serve._folder import private_folder
 from kmn_jax.serve._parts import PartStore, check_name
 from kmn_jax.serve._settings import ServeConfig
 from kmn_jax.serve._warm_up import PLACE, bracket, brackets_on_a_floor
@@ -49,7 +50,7 @@ def serve(
 
     require(camera is None or example is not None, "the camera is that of an example scan: name this, too (--example)")
     listening = listen(config.host, config.port)
-    with contextlib.closing(listening), _private_folder() as folder:
+    with contextlib.closing(listening), private_folder() as folder:
         estimator = PoseEstimator.from_pretrained(weights)
         named = {} if parts is None else _prepared(estimator, parts, config.most_parts)
         store = PartStore(config.most_parts, named)
@@ -153,15 +154,3 @@ def _prepared(estimator: PoseEstimator, folder: Path, most: int) -> dict[str, Pa
             raise InputError(f"{folder} holds two files for the part {path.stem}: remove one")
         named[check_name(path.stem)] = estimator.prepare(path)
     return named
-
-
-@contextlib.contextmanager
-def _private_folder() -> Iterator[Path]:
-    """Make a folder that nobody else can read, in which all temporary files of this process go until it is removed."""
-    before = tempfile.tempdir
-    with tempfile.TemporaryDirectory(prefix="kmn-serve-") as folder:
-        tempfile.tempdir = folder
-        try:
-            yield Path(folder)
-        finally:
-            tempfile.tempdir = before

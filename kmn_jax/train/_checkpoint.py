@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -180,13 +182,28 @@ def _save(path: Path, packed: Packed) -> None:
     staging = path.with_name(f".{path.name}")
     staging.mkdir()
     arrays = {name: array for name, array in packed.arrays.items() if array.size}  # orbax refuses empty ones
-    with _checkpointer() as checkpointer:
+    with _silent_threads(), _checkpointer() as checkpointer:
         checkpointer.save(staging / _STATE, args=ocp.args.PyTreeSave(arrays))
     files = {str(file.relative_to(staging)): _sha256(file) for file in sorted(staging.rglob("*")) if file.is_file()}
     content = json.dumps({"record": packed.record, "files": files})
     stored = {"sha256": hashlib.sha256(content.encode()).hexdigest(), "content": content}
     (staging / _RECORD).write_text(json.dumps(stored), encoding="utf-8")
     staging.rename(path)
+
+
+@contextmanager
+def _silent_threads() -> Iterator[None]:
+    """Let orbax's threads log no tracebacks of what is raised to the caller, too."""
+    log = logging.getLogger("absl")  # which ignores that it is disabled
+    log.addFilter(_nothing)
+    try:
+        yield
+    finally:
+        log.removeFilter(_nothing)
+
+
+def _nothing(_: logging.LogRecord) -> bool:
+    return False
 
 
 def _checked_record(path: Path) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from kmn_jax.detection import Detection, Detections, Scene, placed
 from kmn_jax.errors import InputError
+from kmn_jax.extras import install_command
 from kmn_jax.files import write_whole
 from kmn_jax.geometry import Camera
 from kmn_jax.objects import Part
@@ -65,7 +66,7 @@ def save_picture(
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        raise InputError("pictures need a package that is not installed: pip install 'kmn_jax[plots]'") from None
+        raise InputError(f"pictures need packages that are not installed: {install_command('matplotlib')}") from None
 
     part = part.in_unit(found.unit)
     panels = _Panels(view, part, found)

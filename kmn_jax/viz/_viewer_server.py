@@ -19,6 +19,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from kmn_jax.errors import InputError
+from kmn_jax.extras import install_command
 from kmn_jax.web import is_allowed_host, is_same_origin, listen
 
 _MOST_BYTES = 1_000_000  # of a message; the page's own are small
@@ -70,7 +71,7 @@ def check_page(host: str, port: int) -> None:
     """Raise InputError if no page can be served there: the port is in use, or viser is not installed."""
     listen(host, port).close()
     if find_spec("viser") is None:
-        raise InputError("the page needs a package that is not installed: pip install 'viser>=1.1'")
+        raise InputError(f"the page needs packages that are not installed: {install_command('viser')}")
 
 
 def start_server(host: str, port: int) -> tuple[Any, str]:

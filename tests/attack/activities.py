@@ -5,6 +5,7 @@ To add one, write a class with the members of `Activity` and put it into ACTIVIT
 
 from __future__ import annotations
 
+import json
 import sys
 from functools import cache
 from pathlib import Path
@@ -147,11 +148,45 @@ class Evaluating:
             assert_same_tensors(folder / name, whole / name)
 
 
+class Serving:
+    """`kmn serve` on a folder of parts, with a client that sends others and searches for all of them."""
+
+    def command(self, folder: Path) -> list[str]:
+        """See Activity."""
+        return [sys.executable, "-m", "tests.attack.serving", str(folder)]
+
+    def begun(self, folder: Path) -> bool:
+        """See Activity: the server has made its private folder, and prepares parts next."""
+        return any(folder.glob("temporary/*"))
+
+    def intact(self, folder: Path, whole: Path) -> None:
+        """The parts are as they were, and what the server has confirmed is as without a stop."""
+        for path in folder.glob("parts/[!.]*"):
+            _assert_same_file(folder, whole, f"parts/{path.name}")
+        names = sorted(path.name for path in folder.glob("[!.]*.json"))
+        seen = folder / "seen"
+        lost = set(seen.read_text().splitlines() if seen.exists() else ()) - set(names)
+        assert not lost, f"answers were lost: {sorted(lost)}"
+        for name in names:
+            _assert_same_file(folder, whole, name)
+        seen.write_text("\n".join(names))
+
+    def same(self, folder: Path, whole: Path) -> None:
+        """All is answered as without a stop, with poses among it, and no server has left a file."""
+        names = sorted(path.name for path in whole.glob("*.json"))
+        assert any(json.loads((whole / name).read_text()).get("poses") for name in names)
+        for name in names:
+            _assert_same_file(folder, whole, name)
+        left = [str(path.relative_to(folder)) for path in folder.glob("temporary/*")]
+        assert not left, f"servers left {left}"
+
+
 ACTIVITIES: dict[str, Activity] = {
     "training": Training(),
     "pack building": PackBuilding(),
     "prepare": Preparing(),
     "evaluation": Evaluating(),
+    "serve": Serving(),
 }
 
 

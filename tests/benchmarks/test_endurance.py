@@ -23,7 +23,9 @@ RANDOM = np.random.default_rng(0)
 def flat(count: int = 1000) -> Log:
     seconds = (0.1 * RANDOM.lognormal(sigma=0.2, size=count)).tolist()
     megabytes = (1000 + RANDOM.normal(scale=5, size=count)).tolist()
-    return Log(seconds, megabytes, ["a" if row % 3 else "b" for row in range(count)])
+    return Log(
+        seconds, [1.5 * value for value in seconds], megabytes, ["a" if row % 3 else "b" for row in range(count)]
+    )
 
 
 def test_flat_figures_hold() -> None:
@@ -38,11 +40,19 @@ def test_what_grows_or_slows_or_lacks_does_not() -> None:
     leaking.megabytes = [1000 + 0.1 * row for row in range(1000)]
     assert verdict(leaking, 1000)["fails"] == "memory"
     slowing = flat()
-    slowing.seconds = [value * (1 + row / 4000) for row, value in enumerate(slowing.seconds)]
+    slowing.cpu_seconds = [value * (1 + row / 4000) for row, value in enumerate(slowing.cpu_seconds)]
     assert verdict(slowing, 1000)["fails"] == "latency"
     wrong = flat()
     wrong.untold, wrong.differing = ["a"], ["b"]
     assert verdict(wrong, 1001)["fails"] == "all were done, faults, same bits"
+
+
+def test_a_machine_that_does_more_besides_is_no_trend() -> None:
+    busier = flat()
+    busier.seconds = [value * (1 + row / 1000) for row, value in enumerate(busier.seconds)]
+    found = verdict(busier, 1000)
+    assert found["holds"]
+    assert found["drift"] > 10 * abs(found["cpu drift"])
 
 
 def test_a_step_early_in_memory_is_no_growth() -> None:
@@ -123,7 +133,7 @@ def test_faults_that_are_not_told_and_other_bits_are_noted(
     log, first, frame = Log(), {frames[0].name: b"first"}, frames[0]
     for fault in (None, None, "empty", "all NaN"):
         _step(None, {}, frame, fault, tmp_path, first, log)  # type: ignore[arg-type]
-    assert len(log.seconds) == len(log.megabytes) == 4
+    assert len(log.seconds) == len(log.cpu_seconds) == len(log.megabytes) == 4
     assert [line.startswith("detection 1, ") for line in log.differing] == [True]
     assert [line.startswith("detection 3, ") for line in log.untold] == [True]
     assert (log.faults["empty"], log.told["empty"], log.told["all NaN"]) == (1, 1, 0)

@@ -90,12 +90,15 @@ def test_arrays_are_taken_for_what_they_are() -> None:
     scan = arranged(depth, (50, 50, 25, 20), "m", None, None)
     assert isinstance(scan, Scan)
     assert scan.unit == "m"
+    assert arranged(scan, None, None, None, "m") is arranged(scan, None, None, None, "auto") is scan
     cases: list[tuple[tuple[Any, ...], str]] = [
         ((depth, None, None, None, None), r"shape \(40, 50\): give K with a depth image"),
         ((depth, None, "m", None, None), "depth_unit is for depth images, which need K"),
         (("scan.ply", np.eye(3), None, None, None), "K and depth_unit are for depth images as arrays"),
         ((depth, np.eye(3), None, "camera.json", None), "leave these out"),
         ((depth, np.eye(3), None, None, "mm"), "leave these out"),
+        ((scan, None, None, None, "mm"), "its own camera and unit, here m: leave camera and unit out"),
+        ((scan, None, None, "camera.json", None), "leave camera and unit out"),
     ]
     for arguments, message in cases:
         with pytest.raises(InputError, match=message):

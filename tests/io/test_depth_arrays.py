@@ -106,6 +106,11 @@ def test_a_pose_is_read_in_all_forms(content: Any, unit: str | None, tmp_path: P
         ('{"xyz": [1, 2, 3], "xyzw": [0, 0, 0, 2]}', "xyzw has the length 2, but must be a unit quaternion"),
         ('{"xyz": [1, 2], "xyzw": [0, 0, 0, 1]}', "xyz must be 3 finite numbers"),
         (json.dumps({"T_base_camera": POSE.tolist(), "unit": "ft"}), "unit 'ft' is not known"),
+        (
+            json.dumps({"T_base_camera": POSE.tolist(), "units": "m"}),
+            "it has 'units', which is not known: it may have T_base_camera, unit, xyz, xyzw",
+        ),
+        (json.dumps({"T_base_camera": POSE.tolist(), "xyz": [1, 2, 3]}), "both T_base_camera and xyz or xyzw"),
     ],
 )
 def test_what_is_no_pose_is_one_sentence(content: str, message: str, tmp_path: Path) -> None:
@@ -115,6 +120,16 @@ def test_what_is_no_pose_is_one_sentence(content: str, message: str, tmp_path: P
     assert "pose.json" in str(caught.value)
     with pytest.raises(InputError, match="cannot be read"):
         read_pose(tmp_path / "none.json", "T_base_camera")
+
+
+def test_of_rounded_digits_the_nearest_rotation_is_taken() -> None:
+    rounded = np.round(POSE, 3)
+    assert np.abs(rounded[:3, :3].T @ rounded[:3, :3] - np.eye(3)).max() > 1e-4
+    before = rounded.copy()
+    rotation = pose_matrix(rounded, "T")[:3, :3]
+    np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(rotation, POSE[:3, :3], atol=1e-3)
+    np.testing.assert_array_equal(rounded, before)  # the caller's own
 
 
 def test_a_pose_keeps_its_digits() -> None:

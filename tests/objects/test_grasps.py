@@ -56,15 +56,18 @@ def test_grasps_and_gripper_in_any_unit(tmp_path: Path) -> None:
         ({"unit": None}, "unit 'None' is not known"),
         ({"gripper": {"boxes": []}}, "its gripper has neither boxes nor fingers"),
         ({"gripper": {"box": []}}, "gripper has 'box', which is not known: it may have approach, boxes, fingers"),
-        ({"gripper": {"fingers": {"size": [1, 0, 1]}}}, "the size of the fingers must be three numbers above zero"),
-        ({"gripper": {"boxes": [{"center": [0, 0], "size": [1, 1, 1]}]}}, "the center of a box must be three numbers"),
+        ({"gripper": {"fingers": {"size": [1, 0, 1]}}}, "the size of the fingers must be 3 numbers above zero"),
+        (
+            {"gripper": {"boxes": [{"center": [0, 0], "size": [1, 1, 1]}]}},
+            "the center of a box must be 3 finite numbers",
+        ),
         ({"gripper": {"fingers": {"size": [1, 1, 1]}, "approach": -1}}, "approach must be a number of zero or more"),
         ({"grasps": []}, "it holds no grasps"),
         ({"grasps": [{"width": 3}]}, r"grasp 1: it has no T_object_grasp \(4 x 4 numbers\), and no xyz with xyzw"),
         ({"grasps": [{"T_object_grasp": np.zeros((4, 4)).tolist()}]}, "grasp 1: T_object_grasp is not a rigid pose"),
         ({"grasps": [{**FILE["grasps"][0], "width": "4"}]}, "width of grasp 1 must be a number of zero or more"),
         ({"grasps": [{**FILE["grasps"][0], "width": 10**400}]}, "width of grasp 1 must be a number of zero or more"),
-        ({"gripper": {"boxes": [{"center": [10**400, 0, 0], "size": [1, 1, 1]}]}}, "the center of a box must be three"),
+        ({"gripper": {"boxes": [{"center": [10**400, 0, 0], "size": [1, 1, 1]}]}}, "the center of a box must be 3"),
     ],
 )
 def test_what_is_no_file_of_grasps_is_one_sentence(changes: Any, message: str, tmp_path: Path) -> None:

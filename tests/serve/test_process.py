@@ -142,7 +142,7 @@ def test_connections_are_kept_as_long_as_the_next_head_may_take() -> None:
 
 
 @contextmanager
-def other_server(status: int, content: bytes, part: str = "/parts/a") -> Iterator[str]:
+def other_server(status: int, content: bytes, part: str = "/parts/a", location: str = "") -> Iterator[str]:
     """Serve something else."""
 
     class Other(BaseHTTPRequestHandler):
@@ -150,6 +150,8 @@ def other_server(status: int, content: bytes, part: str = "/parts/a") -> Iterato
             self.rfile.read(int(self.headers["Content-Length"]))
             self.send_response(status)
             self.send_header("Part", part)
+            if location:
+                self.send_header("Location", location)
             self.end_headers()
             self.wfile.write(content)
 
@@ -212,5 +214,12 @@ def test_detect_sends_all_of_a_request_to_a_server(tmp_path: Path, capsys: pytes
             other = "does not answer as kmn serve does" if status == 200 else "says: it answered 500"
             assert f"the server at {address} {other}" in error
             assert error.count("\n") == 1
+    with (
+        running(tmp_path / "private") as server,
+        other_server(302, b"", "/", f"http://127.0.0.1:{server.port}/parts") as one,
+    ):
+        assert main(["detect", *given, "--server", one]) == 2
+        assert f"the server at {one} says: it answered 302" in capsys.readouterr().err
+        assert server.server.server_state.total_requests == 0
     assert main(["detect", *given, "--server", url]) == 2
     assert f"no answer from a server at {url}" in capsys.readouterr().err

@@ -204,6 +204,14 @@ def test_what_cannot_be_written_is_refused(part: Part, view: Scene, found: Detec
     assert list(tmp_path.iterdir()) == []
 
 
+def test_without_matplotlib_a_command_that_installs_it_is_named(
+    part: Part, view: Scene, found: Detections, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(InputError, match=r"need packages that are not installed: pip install .*matplotlib"):
+        save_picture(tmp_path / "result.png", view, part, found)
+
+
 def test_distances_from_the_surface_are_those_of_the_box(part: Part) -> None:
     rng = np.random.default_rng(0)
     on = part.points[rng.integers(0, len(part.points), 500)].astype(np.float64)

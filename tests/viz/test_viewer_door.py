@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -132,3 +133,9 @@ def test_a_page_that_the_door_does_not_guard_is_stopped(monkeypatch: pytest.Monk
     with pytest.raises(InputError, match="cannot be guarded by a token"):
         start_server("127.0.0.1", 0)
     assert len(stopped) == 1
+
+
+def test_without_viser_a_command_that_installs_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(InputError, match=r"needs packages that are not installed: pip install .*viser"):
+        start_server("127.0.0.1", 0)
