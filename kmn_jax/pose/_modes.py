@@ -82,12 +82,13 @@ def _at_once(
     p, q = pairs.object_points, pairs.scene_points
     products = [(q[:, :, None] * p[:, None, :]).reshape(-1, 9), (p[:, :, None] * p[:, None, :]).reshape(-1, 9)]
     terms = pairs.weights[:, None] * jnp.concatenate([jnp.ones((len(p), 1)), p, q, *products], axis=1)
-    refined = poses
-    for gate in gates:
-        inside = jax.vmap(lambda pose, gate=gate: pairs.inliers(pose, gate)[0])(refined).astype(jnp.float32)
-        sums = jnp.matmul(inside, terms, precision=jax.lax.Precision.HIGHEST)
-        refined = jax.vmap(_refitted)(refined, sums)
 
+    def refit(poses: Float[Array, "h 4 4"], gate: Scalar) -> tuple[Float[Array, "h 4 4"], None]:
+        inside = jax.vmap(lambda pose: pairs.inliers(pose, gate)[0])(poses).astype(jnp.float32)
+        sums = jnp.matmul(inside, terms, precision=jax.lax.Precision.HIGHEST)
+        return jax.vmap(_refitted)(poses, sums), None
+
+    refined, _ = jax.lax.scan(refit, poses, gates)
     left, modes, there = scores, [], []
     for _ in range(count):
         row = jnp.argmax(left)
