@@ -35,7 +35,7 @@ def largest_in_any_order(values: Shaped[Array, "... n"], k: int) -> tuple[Shaped
     size = _group_size(values.shape[-1], k)
     if size == 1:
         return _selected(values, k)
-    groups = values.reshape(*values.shape[:-1], -1, size)
+    groups = values.reshape(*values.shape[:-1], values.shape[-1] // size, size)
     _, chosen = _selected(groups.max(axis=-1), k)
     found = jnp.take_along_axis(groups, chosen[..., None], axis=-2)
     best, places = _selected(found.reshape(*values.shape[:-1], k * size), k)
