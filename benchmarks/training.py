@@ -11,6 +11,8 @@ import importlib.util
 import os
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ import tyro
 from benchmarks.network_cases import make_case
 from benchmarks.timing import time_in_turn
 from configs import find_config
+from kmn_jax.data import SampleBatches
 from kmn_jax.models import Compute
 from kmn_jax.report import print_table, write_json
 from kmn_jax.train import (
@@ -38,6 +41,7 @@ from kmn_jax.train import (
 _PACK = "experiments/assets/small_pack"
 _COMPARED = 4  # crops in the batch that is compared with PyTorch
 _BATCHES = 8  # that are drawn and used in turn
+_OBJECTS, _DROPS = 1507, 20  # of the training pack
 
 
 def main(
@@ -78,7 +82,30 @@ def main(
                     rows += throughput_rows(of_batch(changed, batch, on_cpu), devices, repeats)
         results[config.name] = rows
         print_table(f"{config.name}, steps with their data", rows)
+    results["indices"] = index_rows(repeats)
+    print_table("what a host gives to steps that make their samples: indices, drawn by one thread", results["indices"])
     write_json(json, results)
+
+
+def index_rows(repeats: int) -> list[dict[str, Any]]:
+    """Time the drawing of indices for batches of `base`, of the training pack's size, as one of several hosts."""
+    config = find_config("base").pipeline
+    rows = []
+    for batch, hosts in ((128, 1), (1024, 1), (32_768, 64)):
+        batches = SampleBatches(replace(config, batch_size=batch), _OBJECTS, _DROPS, 0, hosts)
+        following = map(batches.__getitem__, count(1))
+        steady = time_in_turn({"draw": partial(next, following)}, repeats)["draw"]
+        share = batch // hosts
+        rows.append(
+            {
+                "batch": batch,
+                "hosts": hosts,
+                "ms": steady.median_ms,
+                "samples/s": 1e3 * share / steady.median_ms,
+                "bytes of a sample": sum(column.nbytes for column in batches[0]) / share,
+            }
+        )
+    return rows
 
 
 def of_batch(config: TrainConfig, batch: int, on_cpu: bool) -> TrainConfig:

@@ -13,6 +13,7 @@ from kmn_jax.geometry._knn import (
     neighbor_graph,
     squared_distances,
 )
+from kmn_jax.geometry._linear import solve_symmetric
 from kmn_jax.geometry._normals import depth_normals, depth_to_points, estimate_normals, orient_to_camera
 from kmn_jax.geometry._order import space_filling_order
 from kmn_jax.geometry._sampling import farthest_point_indices
@@ -78,6 +79,7 @@ __all__ = [
     "safe_norm",
     "safe_sqrt",
     "smoothed",
+    "solve_symmetric",
     "space_filling_order",
     "spread_rows",
     "squared_distances",

@@ -8,11 +8,14 @@ from functools import partial
 from importlib.util import find_spec
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Int, Shaped
 
 # From version 0.11 on JAX takes a promise back; before that, XLA has to be told: see `ask_for_fast_selection`.
 _ANY_TIES = {"is_stable": False} if "is_stable" in inspect.signature(jax.lax.top_k).parameters else {}
 _FLAG = "xla_gpu_experimental_use_raft_select_k"
+_GROUP_SIZES = (4, 8, 16, 32)
+_WORTH_GROUPS = 4  # times fewer numbers to select from, for which more kernels are started
 _GPU_PACKAGES = ("jax_cuda12_plugin", "jax_cuda13_plugin")
 
 
@@ -24,7 +27,32 @@ def largest(values: Shaped[Array, "... n"], k: int) -> tuple[Shaped[Array, "... 
 
 
 def largest_in_any_order(values: Shaped[Array, "... n"], k: int) -> tuple[Shaped[Array, "... k"], Int[Array, "... k"]]:
-    """Return the k largest of each row, in order but for equal ones, and their places."""
+    """Return the k largest of each row, in order but for equal ones, and their places.
+
+    Where k are few of many, they are found in the k groups whose largest are largest: what takes time is how many
+    numbers a selection is given.
+    """
+    size = _group_size(values.shape[-1], k)
+    if size == 1:
+        return _selected(values, k)
+    groups = values.reshape(*values.shape[:-1], values.shape[-1] // size, size)
+    _, chosen = _selected(groups.max(axis=-1), k)
+    found = jnp.take_along_axis(groups, chosen[..., None], axis=-2)
+    best, places = _selected(found.reshape(*values.shape[:-1], k * size), k)
+    return best, size * jnp.take_along_axis(chosen, places // size, axis=-1) + places % size
+
+
+def _group_size(count: int, k: int) -> int:
+    """Return how many numbers a group is to have, 1 if groups would not leave a fraction to select from."""
+
+    def left(size: int) -> float:
+        return count / size + k * size
+
+    best = min((size for size in _GROUP_SIZES if count % size == 0), key=left, default=1)
+    return best if _WORTH_GROUPS * left(best) <= count else 1
+
+
+def _selected(values: Shaped[Array, "... n"], k: int) -> tuple[Shaped[Array, "... k"], Int[Array, "... k"]]:
     best, places = jax.lax.top_k(values, k, **_ANY_TIES)
     return best, places
 

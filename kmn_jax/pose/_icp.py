@@ -20,6 +20,7 @@ from kmn_jax.geometry import (
     nearest,
     nearest_within,
     rotate_vectors,
+    solve_symmetric,
     transform_points,
 )
 from kmn_jax.pose._kabsch import fit_rigid, rotation_is_determined
@@ -29,6 +30,7 @@ from kmn_jax.typing import ArrayInput, Mask, Normals, Points, Pose, Scalar
 _MIN_PAIRS = 6  # equations that fix a pose when each pair gives one
 _DIVERGED = 0.01  # of the squared gate: a cost that grows by less is noise about the optimum
 _FEW_DISTANCES = 2**20  # up to which all of them take CPUs less time than groups
+_FEW_ROUNDS = 20  # up to which accelerators make all of them: they cost less than to wait for each one's answer
 _ALIKE = 0.3  # cosine of normals: pairs of less are of two surfaces
 _DAMPING = 1e-5  # of the mean diagonal: directions that no pair constrains stay where they are
 
@@ -214,10 +216,24 @@ def _icp(
     def is_moving(state: _State) -> Bool[Array, ""]:
         return (state.step < config.iterations) & (state.change > config.tolerance)
 
+    def until_still(state: _State) -> _State:
+        return jax.lax.while_loop(is_moving, iterate, state)
+
+    def without_asking(state: _State) -> _State:
+        """Do the same, but for rounds that change nothing: a host that starts kernels need not wait for an answer."""
+
+        def iterate_if_moving(state: _State, _: None) -> tuple[_State, None]:
+            moving = is_moving(state)
+            return jax.tree.map(lambda new, old: jnp.where(moving, new, old), iterate(state), state), None
+
+        return jax.lax.scan(iterate_if_moving, state, length=config.iterations)[0]
+
     start = from_rotation_translation(initial[:3, :3], jnp.zeros(3))
     first = find_pairs(start)
-    state = jax.lax.while_loop(
-        is_moving, iterate, _State(jnp.int32(0), start, first, jnp.array(jnp.inf), jnp.array(True))
+    state = jax.lax.platform_dependent(
+        _State(jnp.int32(0), start, first, jnp.array(jnp.inf), jnp.array(True)),
+        cpu=until_still,
+        default=without_asking if config.iterations <= _FEW_ROUNDS else until_still,
     )
 
     status = first_status(
@@ -256,11 +272,11 @@ def _robust_weight(residual: Float[Array, " n"], kind: str) -> Float[Array, " n"
 
 def _plane_step(moved: Points, normals: Normals, residual: Float[Array, " n"], weights: Float[Array, " n"]) -> Pose:
     """Return the small motion that brings points onto their planes, by the damped 6x6 normal equations."""
-    jacobian = jnp.concatenate([jnp.cross(moved, normals), normals], axis=1)
-    weighted = weights[:, None] * jacobian
-    system = jnp.matmul(weighted.T, jacobian, precision=jax.lax.Precision.HIGHEST)
-    right = -(weighted * residual[:, None]).sum(axis=0)
+    rows = jnp.concatenate([jnp.cross(moved, normals), normals, residual[:, None]], axis=1)
+    # The residual is one column more: all sums are one product.
+    sums = jnp.matmul((weights[:, None] * rows).T, rows, precision=jax.lax.Precision.HIGHEST)
+    system = sums[:6, :6]
     damping = _DAMPING * jnp.trace(system) / 6
-    solution = jnp.linalg.solve(system + jnp.where(damping > 0, damping, 1) * jnp.eye(6), right)
+    solution = solve_symmetric(system + jnp.where(damping > 0, damping, 1) * jnp.eye(6), -sums[:6, 6])
     # A quaternion of any length turns by a proper rotation, also when the linear step is not small.
     return from_quaternion_translation(jnp.concatenate([jnp.ones(1), solution[:3] / 2]), solution[3:])

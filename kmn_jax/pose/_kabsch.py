@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from kmn_jax.errors import InputError, float_array, is_traced, row_count
-from kmn_jax.geometry import dominant_eigenvector, from_rotation_translation, quaternion_to_matrix
+from kmn_jax.geometry import dominant_eigenvector, from_rotation_translation, quaternion_to_matrix, solve_symmetric
 from kmn_jax.typing import ArrayInput, Points, Pose, Rotation
 
 _MIN_SPREAD = 1e-4  # variance across the line over variance along it, below which points count as collinear
@@ -99,7 +99,7 @@ def _best_rotation_jvp(
 
     With dR = R [omega]x it reads (tr(S) I - S) omega = vee(R^T dC - dC^T R). That matrix has the sums of two
     singular values as eigenvalues, not their differences: repeated ones do no harm. It is singular
-    only where the rotation itself is open (collinear points), which the bounded pivots of `_solve` absorb.
+    only where the rotation itself is open (collinear points), which the bounded pivots of `solve_symmetric` absorb.
     """
     (covariance,), (tangent,) = primals, tangents
     rotation = best_rotation(covariance)
@@ -110,7 +110,7 @@ def _best_rotation_jvp(
     system = jnp.trace(stretch) * jnp.eye(3, dtype=stretch.dtype) - stretch
     turned = _product(rotation.T, tangent)
     skew = turned - turned.T
-    x, y, z = _solve(system, jnp.stack([skew[2, 1], skew[0, 2], skew[1, 0]]))
+    x, y, z = solve_symmetric(system, jnp.stack([skew[2, 1], skew[0, 2], skew[1, 0]]))
     zero = jnp.zeros_like(x)
     cross = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
     return rotation, _product(rotation, cross)
@@ -124,7 +124,11 @@ def rotation_is_determined(points: Points, weights: Float[Array, " n"]) -> Bool[
     weights = _normalised(weights)
     _, centred = _centre(points, weights)
     centred = centred / _magnitude(centred)
-    scatter = (weights[:, None, None] * centred[:, :, None] * centred[:, None, :]).sum(axis=0)
+    return spread_is_determined((weights[:, None, None] * centred[:, :, None] * centred[:, None, :]).sum(axis=0))
+
+
+def spread_is_determined(scatter: Float[Array, "3 3"]) -> Bool[Array, ""]:
+    """Tell the same from the points' second moments about their mean."""
     # Sum of the principal 2x2 minors over the squared trace: about the ratio of the two largest eigenvalues.
     trace = jnp.trace(scatter)
     minors = (trace**2 - (scatter**2).sum()) / 2
@@ -158,20 +162,3 @@ def _magnitude(values: Array) -> Float[Array, ""]:
 
 def _product(a: Float[Array, "3 3"], b: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     return (a[:, :, None] * b[None, :, :]).sum(axis=1)
-
-
-def _solve(system: Float[Array, "3 3"], right: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Solve a positive semi-definite 3x3 system by LDL^T with pivots held above the rounding of its trace."""
-    smallest = 4 * jnp.finfo(system.dtype).eps * jnp.maximum(jnp.trace(system), 1e-3)
-    d0 = jnp.maximum(system[0, 0], smallest)
-    l10, l20 = system[1, 0] / d0, system[2, 0] / d0
-    d1 = jnp.maximum(system[1, 1] - l10 * system[1, 0], smallest)
-    l21 = (system[2, 1] - l20 * system[1, 0]) / d1
-    d2 = jnp.maximum(system[2, 2] - l20 * system[2, 0] - l21 * l21 * d1, smallest)
-    y0 = right[0]
-    y1 = right[1] - l10 * y0
-    y2 = right[2] - l20 * y0 - l21 * y1
-    x2 = y2 / d2
-    x1 = y1 / d1 - l21 * x2
-    x0 = y0 / d0 - l10 * x1 - l20 * x2
-    return jnp.stack([x0, x1, x2])

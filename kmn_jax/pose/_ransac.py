@@ -15,14 +15,11 @@ from kmn_jax.errors import InputError, float_array, is_traced, mask_array, posit
 from kmn_jax.geometry import from_rotation_translation, largest
 from kmn_jax.pose._kabsch import fit_rigid, rotation_is_determined
 from kmn_jax.pose._matches import Matches
+from kmn_jax.pose._modes import Pairs, refined_modes
 from kmn_jax.pose._result import PoseResult, PoseStatus, first_status
 from kmn_jax.typing import ArrayInput, Mask, Normals, Points, Pose, PRNGKey, Scalar
 
 _MIN_HEIGHT = 0.01  # of the diameter: a flatter triangle says nothing about the rotation about its long side
-
-# Poses that differ by more, in rotation or by so many diameters, are another mode.
-_MODE_DEGREES = 30.0
-_MODE_DISTANCE = 0.15
 
 
 @dataclass(frozen=True)
@@ -159,51 +156,30 @@ def _ransac(key: PRNGKey, matches: Matches, config: RansacConfig, num_modes: int
 
     object_centre, object_points = _centred(matches.object_points, usable, unit)
     scene_centre, scene_points = _centred(matches.scene_points, usable, unit)
-    object_normals = _normalised(matches.object_normals, usable)
-    scene_normals = _normalised(matches.scene_normals, usable)
-    weights = jnp.where(usable, matches.weights, 0)
+    pairs = Pairs(
+        object_points,
+        scene_points,
+        _normalised(matches.object_normals, usable),
+        _normalised(matches.scene_normals, usable),
+        jnp.where(usable, matches.weights, 0),
+        usable,
+        jnp.float32(config.min_cosine) if config.use_normals else None,
+    )
 
     triplets, is_candidate = _congruent_triplets(key, object_points, scene_points, usable, config)
     poses = jax.vmap(fit_rigid, in_axes=(0, 0, None))(object_points[triplets], scene_points[triplets], jnp.ones(3))
 
-    def inliers(pose: Pose, gate: Scalar | float) -> tuple[Mask, Float[Array, " n"]]:
-        """Compare all matches with one pose, coordinate by coordinate: under vmap it stays one fused loop."""
-        squares, cosines = jnp.zeros(()), jnp.zeros(())
-        for row in range(3):
-            r0, r1, r2, shift = pose[row, 0], pose[row, 1], pose[row, 2], pose[row, 3]
-            x, y, z = object_points[:, 0], object_points[:, 1], object_points[:, 2]
-            squares = squares + (r0 * x + r1 * y + r2 * z + shift - scene_points[:, row]) ** 2
-            x, y, z = object_normals[:, 0], object_normals[:, 1], object_normals[:, 2]
-            cosines = cosines + (r0 * x + r1 * y + r2 * z) * scene_normals[:, row]
-        agree = usable & (squares <= gate * gate)
-        if config.use_normals:
-            agree = agree & (cosines >= config.min_cosine)
-        return agree, squares
-
-    counts = jax.vmap(lambda pose: inliers(pose, config.distance_gate)[0].sum(dtype=jnp.int32))(poses)
-
-    def refine(pose: Pose, gate: Scalar) -> tuple[Pose, None]:
-        inlier_weights = jnp.where(inliers(pose, gate)[0], weights, 0)
-        refined = fit_rigid(object_points, scene_points, inlier_weights)
-        # Kabsch always answers; with inliers on a line, or none, the answer would be arbitrary.
-        return jnp.where(rotation_is_determined(object_points, inlier_weights), refined, pose), None
+    counts = jax.vmap(lambda pose: pairs.inliers(pose, config.distance_gate)[0].sum(dtype=jnp.int32))(poses)
 
     gates = jnp.array(config.refinement_gates, dtype=jnp.float32)
-
-    def next_mode(score: Int[Array, " h"], _: None) -> tuple[Int[Array, " h"], tuple[Pose, Bool[Array, ""]]]:
-        row = jnp.argmax(score)
-        mode, _ = jax.lax.scan(refine, poses[row], gates)
-        return jnp.where(_differ(poses, mode), score, -1), (mode, score[row] >= 0)
-
-    start = jnp.where(is_candidate, counts, -1)
-    _, (modes, there) = jax.lax.scan(next_mode, start, length=num_modes)
+    modes, there = refined_modes(poses, jnp.where(is_candidate, counts, -1), pairs, gates, num_modes)
 
     def finish(best: Pose, is_there: Bool[Array, ""]) -> PoseResult:
-        inlier_mask, squares = inliers(best, config.distance_gate)
+        inlier_mask, squares = pairs.inliers(best, config.distance_gate)
         num_inliers = inlier_mask.sum(dtype=jnp.int32)
         share = jnp.ceil(config.min_inlier_share * num_usable.astype(jnp.float32)).astype(jnp.int32)
         required = jnp.maximum(config.min_inliers, share)
-        spread = rotation_is_determined(object_points, jnp.where(inlier_mask, weights, 0))
+        spread = rotation_is_determined(object_points, jnp.where(inlier_mask, pairs.weights, 0))
         pose = from_rotation_translation(
             best[:3, :3], unit * best[:3, 3] + scene_centre - (best[:3, :3] * object_centre[None, :]).sum(axis=1)
         )
@@ -228,14 +204,6 @@ def _ransac(key: PRNGKey, matches: Matches, config: RansacConfig, num_modes: int
         )
 
     return jax.vmap(finish)(modes, there)
-
-
-def _differ(poses: Float[Array, "h 4 4"], pose: Pose) -> Bool[Array, " h"]:
-    """Return which poses of centred points, in diameters, are another mode than the given one."""
-    trace = (poses[:, :3, :3] * pose[None, :3, :3]).sum(axis=(1, 2))
-    turned = trace < 1 + 2 * cos(radians(_MODE_DEGREES))
-    moved = ((poses[:, :3, 3] - pose[None, :3, 3]) ** 2).sum(axis=1) > _MODE_DISTANCE**2
-    return turned | moved
 
 
 def _congruent_triplets(

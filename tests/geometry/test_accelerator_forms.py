@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from kmn_jax.geometry import (
-    _eigen,
     _selection,
     ask_for_fast_selection,
     dominant_eigenvector,
@@ -20,6 +19,7 @@ from kmn_jax.geometry import (
     neighbor_graph,
     normals_within_radius,
 )
+from tests.reference.devices import accelerator_forms
 
 pytestmark = pytest.mark.usefixtures("few_optimisations")  # unrolled loops take long to compile
 
@@ -40,6 +40,8 @@ def points() -> jax.Array:
         lambda x: jax.vmap(lambda y: dominant_eigenvector(jnp.outer(y, y) + jnp.eye(3)))(x),
         lambda x: normals_within_radius(x, x, 1.0),
         lambda x: largest(x[:, 0], 30),
+        lambda x: largest(jnp.where(x[:100, :1] > 0, jnp.tile(x.reshape(1, -1)[:, :128], (100, 1)), -jnp.inf), 3),
+        lambda x: jnp.sort(neighbor_graph(x[:128], 3, jnp.arange(128) % 5 > 0)),
     ],
     ids=[
         "k_nearest",
@@ -50,19 +52,14 @@ def points() -> jax.Array:
         "eigenvectors",
         "planes",
         "selection",
+        "selection from groups",
+        "neighbors from groups",
     ],
 )
-def test_both_forms_agree(function: Callable[[jax.Array], Any], points: jax.Array, monkeypatch: Any) -> None:
+def test_both_forms_agree(function: Callable[[jax.Array], Any], points: jax.Array) -> None:
     of_cpu = jax.jit(lambda x: function(x))(points)
-    asked = []
-
-    def other_form(*arguments: Any, default: Callable[..., Any], **_: Any) -> Any:
-        asked.append(default)
-        return default(*arguments)
-
-    monkeypatch.setattr(jax.lax, "platform_dependent", other_form)
-    monkeypatch.setattr(_eigen, "_AT_ONCE", 3)  # longer pieces take long to compile
-    found = jax.jit(lambda x: function(x))(points)
+    with accelerator_forms() as asked:
+        found = jax.jit(lambda x: function(x))(points)
     assert asked
     # Eigenvectors of 24 squarings agree to rounding of each.
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), found, of_cpu)
