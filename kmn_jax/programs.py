@@ -139,10 +139,10 @@ class _Store:
         self.read: dict[str, Future[Any]] = {}
 
     def begin(self) -> None:
-        """Begin to read all programs, the longest ones first, unless that was done."""
+        """Begin to read all programs, those that were used last first, unless that was done."""
         if self.read:
             return
-        files = sorted(self.folder.glob("*.export"), key=lambda path: -path.stat().st_size)
+        files = self._files()
         pool = ThreadPoolExecutor(2, thread_name_prefix="programs")
         self.read = {path.name: pool.submit(_read, path) for path in files[:_MOST]}
         pool.shutdown(wait=False)
@@ -163,7 +163,11 @@ class _Store:
             text = "\n".join(map(repr, (*fixed.items(), tree, shapes)))
             name = f"{of.function.__name__}-{hashlib.sha256(text.encode()).hexdigest()[:32]}.export"
             read = self.read.get(name)
-            made.set_result((read and read.result()) or self._make(name, of, fixed, tree, leaves))
+            program = read and read.result()
+            if program:
+                with contextlib.suppress(OSError):
+                    os.utime(self.folder / name)
+            made.set_result(program or self._make(name, of, fixed, tree, leaves))
         except BaseException as error:
             made.set_exception(error)
             raise
@@ -180,10 +184,22 @@ class _Store:
             content = bytes(exported.serialize())
         except (NotImplementedError, ValueError):  # what JAX says of programs that cannot be exported
             return None
-        if len(list(self.folder.glob("*.export"))) < _MOST:
-            with contextlib.suppress(OSError):
-                write_whole(self.folder / name, hashlib.sha256(content).digest() + content)
+        with contextlib.suppress(OSError):
+            for unused in self._files()[_MOST - 1 :]:
+                unused.unlink(missing_ok=True)
+            write_whole(self.folder / name, hashlib.sha256(content).digest() + content)
         return _compiled(exported)
+
+    def _files(self) -> list[Path]:
+        """Return what is kept, what was used last first."""
+        return sorted(self.folder.glob("*.export"), key=_last_used, reverse=True)
+
+
+def _last_used(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:  # another process has removed it
+        return 0.0
 
 
 def _read(path: Path) -> Callable[..., Any] | None:
@@ -216,6 +232,6 @@ def _version() -> str:
 
 def _forget_old(folder: Path) -> None:
     """Remove what versions that were not used lately have left."""
-    folders = sorted((path for path in folder.iterdir() if path.is_dir()), key=lambda path: -path.stat().st_mtime)
+    folders = sorted((path for path in folder.iterdir() if path.is_dir()), key=_last_used, reverse=True)
     for old in folders[_FOLDERS:]:
         shutil.rmtree(old, ignore_errors=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -120,9 +121,16 @@ def test_what_cannot_be_exported_is_compiled_as_ever(folder: Path) -> None:
 
 def test_a_folder_does_not_grow_without_bound(folder: Path) -> None:
     program, _ = counted()
-    for size in range(1, programs._MOST + 3):
-        program(*given(size), factor=1.0)
-    assert len(files(folder)) == programs._MOST
+    program(*given(), factor=1.0)
+    (first,) = files(folder)
+    for number in range(programs._MOST):
+        (first.parent / f"old-{number}.export").write_bytes(b"")
+        os.utime(first.parent / f"old-{number}.export", (number, number))
+    program(*given(), factor=2.0)
+    left = files(folder)
+    assert len(left) == programs._MOST
+    assert first in left  # what was used last
+    assert not (first.parent / "old-0.export").exists()
     for number in range(4):
         (folder / f"version{number}").mkdir()
     keep_programs(folder)
