@@ -87,9 +87,9 @@ def test_a_larger_capacity_gives_the_same_pose_and_compiles_the_crop_alone(
     scene = padded(cases[0].points)
     larger = jax.tree.map(lambda leaf: jnp.concatenate([leaf, jnp.zeros_like(leaf)]), scene)
     one = solve(model, part, scene)
-    before = find_poses_in_crop._cache_size(), crop_of_scene._cache_size()
+    before = find_poses_in_crop.compiled._cache_size(), crop_of_scene.compiled._cache_size()
     other = solve(model, part, larger)
-    after = find_poses_in_crop._cache_size(), crop_of_scene._cache_size()
+    after = find_poses_in_crop.compiled._cache_size(), crop_of_scene.compiled._cache_size()
     np.testing.assert_array_equal(one.T_scene_object, other.T_scene_object)
     assert after == (before[0], before[1] + 1)
 

@@ -110,7 +110,7 @@ def test_seeds_are_no_more_than_asked_for_or_needed(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    "values", [{"most_seeds": 0}, {"later_seeds": 0}, {"reported": 0.8}, {"likely": 1.5}, {"patience": 0}]
+    "values", [{"most_seeds": 0}, {"later_seeds": 0}, {"reported": 0.9}, {"likely": 1.5}, {"patience": 0}]
 )
 def test_contradictory_values_are_refused(values: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(values))):

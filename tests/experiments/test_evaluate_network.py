@@ -154,11 +154,11 @@ def test_a_broken_run_is_not_released(
     assert not list(tmp_path.glob("released/*"))
 
 
-@pytest.mark.parametrize("arguments", [["nowhere.safetensors"], ["--test-sets", "nowhere"]])
+@pytest.mark.parametrize("arguments", [["nowhere.safetensors", "--test-sets", "."], ["--test-sets", "nowhere"]])
 def test_what_cannot_be_read_is_one_sentence(
     run: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    model = [] if len(arguments) == 1 else [str(run)]
+    model = [] if arguments[0].endswith(".safetensors") else [str(run)]
     assert evaluate_network.main([*model, *arguments, "--pack", "nowhere"]) == 2
     message = capsys.readouterr().err
     assert message.startswith("evaluate_network: ")

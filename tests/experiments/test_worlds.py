@@ -88,7 +88,7 @@ def test_counts(folder: Path, model: Model) -> None:
     tally = WorldTally()
     beside = present.truth[0] + np.array([[0, 0, 0, 1000.0]] * 3 + [[0] * 4])
     tally.add(present, Tally.of(present, found(present, [present.truth[0], beside], 0.95)))
-    tally.add(absent, Tally.of(absent, found(absent, [np.eye(4)], 0.7)))
+    tally.add(absent, Tally.of(absent, found(absent, [np.eye(4)], 0.85)))
     tally.add_stranger(found(present, [np.eye(4)], 0.2))
     row = tally.row("these")
     assert row["precision"] == pytest.approx(1 / 3)

@@ -39,6 +39,7 @@ def test_arguments_are_fields(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
         return Outcome(3, "SIGTERM came", None, 0)
 
     monkeypatch.setattr("experiments.train.train", stopped)
+    monkeypatch.setattr("experiments.train.require_made", lambda *folders: None)
     options = {"max_minutes": None, "resume": False}
     for name, config in CONFIGS.items():
         assert main([name]) == 0
