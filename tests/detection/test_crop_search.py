@@ -31,7 +31,7 @@ from kmn_jax.errors import InputError
 from kmn_jax.geometry import PaddedCloud
 from kmn_jax.models import Model, load_model, released_file
 from kmn_jax.objects import PartArrays, arrays_of, make_part
-from kmn_jax.pose import PoseResult, PoseStatus, adi, ransac
+from kmn_jax.pose import IcpConfig, PoseResult, PoseStatus, adi, ransac
 
 pytestmark = pytest.mark.usefixtures("few_optimisations")
 
@@ -145,8 +145,10 @@ def test_one_draw_and_one_pose_are_the_published_search(model: Model, part: Part
 
 def test_poses_differ_the_best_first_and_are_refined(model: Model, part: PartArrays, cases: list[Case]) -> None:
     rough, fine = (
-        jax.device_get(poses_at(model, part, padded(cases[0].points), 0, 0, replace(CONFIG, icp=icp)))
-        for icp in (None, CropSearchConfig().icp)
+        jax.device_get(
+            poses_at(model, part, padded(cases[0].points), 0, 0, replace(CONFIG, icp=IcpConfig(iterations=rounds)))
+        )
+        for rounds in (1, 8)
     )
     there = rough.poses.converged
     assert there[0]
