@@ -32,6 +32,7 @@ _Result = TypeVar("_Result")
 _MOST = 24  # programs of a folder that are kept
 _FOLDERS = 2  # of programs: of this version of the package, and of the one that was used before
 _DIGEST = 32  # bytes
+_PROCESS = 60.0  # seconds: what was used within so many was used by one process
 _store: _Store | None = None
 
 
@@ -139,10 +140,12 @@ class _Store:
         self.read: dict[str, Future[Any]] = {}
 
     def begin(self) -> None:
-        """Begin to read all programs, those that were used last first, unless that was done."""
+        """Begin to read all programs, unless that was done: those of the last process first, as it used them."""
         if self.read:
             return
         files = self._files()
+        last = [path for path in files if _last_used(path) > _last_used(files[0]) - _PROCESS]
+        files = [*reversed(last), *files[len(last) :]]
         pool = ThreadPoolExecutor(2, thread_name_prefix="programs")
         self.read = {path.name: pool.submit(_read, path) for path in files[:_MOST]}
         pool.shutdown(wait=False)
