@@ -1,18 +1,23 @@
-"""The commands in README.md and docs/ are commands that exist, with flags and files that exist."""
+"""The commands in README.md and docs/: all are commands that exist, and those that search files run as pasted."""
 
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from kmn_jax.arguments import joined, parsed
-from kmn_jax.cli import convert, detect, export, prepare, serve, view
+from kmn_jax.bop import bop_scan
+from kmn_jax.cli import convert, detect, export, main, prepare, serve, view
 
 ROOT = Path(__file__).parent.parent
+ASSETS = ROOT / "experiments" / "assets"
+IMAGE = ASSETS / "small_test_set" / "test" / "000002" / "depth" / "000002.png"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 OWN = {  # what stands for the reader's own files
     *("part.stl", "part.kmn", "part.grasps.json", "scan.ply", "empty_bin.ply", "depth.png", "scan.png", "camera.json"),
@@ -55,3 +60,48 @@ def test_the_command_exists(words: list[str]) -> None:
         assert (ROOT / rest[0]).is_file()
     else:
         assert program in ("pip", "git", "cp"), "what is it?"
+
+
+@pytest.fixture
+def own_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder of a reader with a part, scans of it, a camera, and what a robot needs; it is where we are."""
+    scan, _ = bop_scan(IMAGE)
+    assert scan.camera is not None
+    (tmp_path / "part.stl").symlink_to(ASSETS / "industrial" / "gear_motor.stl")
+    (tmp_path / "experiments").symlink_to(ROOT / "experiments")
+    (tmp_path / "depth.png").write_bytes(IMAGE.read_bytes())
+    matrix = scan.camera.matrix
+    camera = {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2], "depth_scale": 0.02}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    low, high = scan.points.min(axis=0), scan.points.max(axis=0)
+    floor = np.stack(np.meshgrid(*np.linspace(low[:2], high[:2], 150).T, high[2]), axis=-1).reshape(-1, 3)
+    # The guide's point to search at, 12,-40,630, is on a copy: the one in the middle.
+    shift = np.array([12.0, -40, 630]) - [18, -21, 700]
+    for name, points in (("scan.ply", scan.points), ("empty_bin.ply", floor)):
+        header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
+        header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+        (tmp_path / name).write_bytes(header.encode() + (points + shift).astype("<f4").tobytes())
+    gripper = {"boxes": [{"center": [0, 0, -40], "size": [90, 40, 20]}]}
+    ways = [{"T_object_grasp": [[0, 0, -1, 0], [1, 0, 0, 0], [0, -1, 0, -30], [0, 0, 0, 1]], "width": 40}]
+    (tmp_path / "part.grasps.json").write_text(json.dumps({"unit": "mm", "gripper": gripper, "grasps": ways}))
+    (pose,) = re.findall(r"^```json\n(.*?)^```$", (ROOT / "docs" / "detect.md").read_text(), re.M | re.S)
+    (tmp_path / "camera_pose.json").write_text(pose)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_searches_run_as_they_are_pasted(own_files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    guide, grasps = ROOT / "docs" / "detect.md", ROOT / "docs" / "grasps.md"
+    (first,) = (block for block in blocks(ROOT / "README.md") if block.startswith("kmn detect"))
+    (own,) = (block for block in blocks(ROOT / "README.md") if block.startswith("kmn prepare"))
+    (place,) = (words for words in commands(blocks(guide)[0]) if "--at" in words)
+    run = [words for words in [*commands(first), *commands(own), place] if words[1] in ("prepare", "detect")]
+    assert len(run) == 6
+    assert blocks(grasps)[0].count("--grasps part.grasps.json") == 2  # the same as in README
+    for words in run:
+        capsys.readouterr()
+        assert main(words[1:]) == 0, capsys.readouterr().err
+        if words[1] == "detect":
+            assert "nothing found" not in capsys.readouterr().out, words
+    assert (own_files / "bin.png").read_bytes().startswith(b"\x89PNG")
+    assert json.loads((own_files / "poses.json").read_text())["poses"]
