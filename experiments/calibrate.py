@@ -33,6 +33,7 @@ from kmn_jax.detection import (
     Calibration,
     Candidates,
     DetectConfig,
+    DevicePart,
     Probabilities,
     Scene,
     SearchConfig,
@@ -78,6 +79,7 @@ class Search(NamedTuple):
 
     image: TrueImage
     part: Part  # the image's own, or its stranger
+    on_device: DevicePart
     scene: Scene
     number: int  # that searches of one object, or of one family of parts, share
     found: Candidates
@@ -103,14 +105,14 @@ def collect(options: Options) -> dict[str, np.ndarray]:
     pairs = [
         (search, refined)
         for search in tqdm(searches, unit="search", desc="refinement")
-        if (refined := _refined(model, search, chooser, config)) is not None
+        if (refined := _refined(search, chooser, config)) is not None
     ]
     fine = _joined([search.columns(refined) for search, refined in pairs])
     fine["refined"] = np.ones(len(fine["error"]), dtype=bool)
     others = {name: fitted for names, fitted in held_out_models(fine, options) for name in names}
     kept = []
     for search, refined in pairs:
-        choice = chosen(refined, others[search.number], device_part(model, search.part), DetectConfig())
+        choice = chosen(refined, others[search.number], search.on_device, DetectConfig())
         kept.append(choice.kept[refined.usable])
     none = np.zeros(len(found["error"]), dtype=bool)
     found |= {"refined": none, "reported": none}
@@ -133,7 +135,7 @@ def _searches(options: Options, model: Model, config: SearchConfig) -> Iterator[
                 found = fpfh_poses(part, on_device, scene, rows)
             else:
                 found = search_at(model, on_device, scene, rows, 0, config)
-            yield Search(image, part, scene, number, found)
+            yield Search(image, part, on_device, scene, number, found)
 
 
 def _images(options: Options, model: Model) -> Iterator[tuple[int, TrueImage, Scene]]:
@@ -150,12 +152,11 @@ def _images(options: Options, model: Model) -> Iterator[tuple[int, TrueImage, Sc
                 yield (found.object_id - 1) // PARTS_A_FAMILY, found, make_scene(found.scan, found.part.diameter)
 
 
-def _refined(model: Model, search: Search, chooser: Calibration, config: SearchConfig) -> Candidates | None:
+def _refined(search: Search, chooser: Calibration, config: SearchConfig) -> Candidates | None:
     """Return the refined forms of what a model chooses among the poses of a search; None if it chooses nothing."""
-    on_device = device_part(model, search.part)
-    choice = chosen(search.found, chooser, on_device, _LOOSE)
+    choice = chosen(search.found, chooser, search.on_device, _LOOSE)
     rows = np.flatnonzero(choice.kept | choice.contenders)
-    return refined_candidates(on_device, search.scene, search.found, rows, 0, config) if len(rows) else None
+    return refined_candidates(search.on_device, search.scene, search.found, rows, 0, config) if len(rows) else None
 
 
 def held_out_models(
@@ -192,8 +193,9 @@ def fit(poses: dict[str, np.ndarray], options: Options) -> tuple[Calibration, di
         own = np.isin(poses["object"], names)
         held_out[own] = others.logit(poses["evidence"][own])
     model = _model(poses, options)
-    judged = poses["reported"] if poses["reported"].any() else np.ones_like(right)
+    judged = np.ones_like(right)
     if poses["reported"].any():
+        judged = poses["reported"]
         scale = fit_calibration(held_out[judged, None], right[judged], ("logit",), hidden_units=0)
         model, held_out = model.scaled(scale.weights[0], scale.bias), scale.weights[0] * held_out + scale.bias
     probability, right, there = 1 / (1 + np.exp(-held_out[judged])), right[judged], there[judged]

@@ -12,7 +12,7 @@ _MAKERS = {  # by folder: what is asked of experiments.build_data
     "outputs/worlds": "worlds",
     "outputs/packs/electronics": "electronics",
     "outputs/packs/electronics_120": "electronics --limit 120 --folder outputs/packs/electronics_120",
-    "outputs/packs/surfels": "electronics --folder outputs/packs/surfels --pack.drops 0",
+    "outputs/packs/surfels": "surfels",
     "outputs/packs/per_object": "per-object --cad FILE --folder outputs/packs/per_object",
 }
 

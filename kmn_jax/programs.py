@@ -54,7 +54,7 @@ def keep_compiled() -> None:
 
 
 def keep_programs(folder: Path | None) -> None:
-    """Keep programs in a folder, and read those that are there; None: keep none from now on."""
+    """Keep programs in a folder from now on, where `read_kept` finds those of before; None: keep none."""
     global _store
     _store = None
     if folder is not None:

@@ -22,9 +22,8 @@ def prepare_kept(estimator: PoseEstimator, source: Path, unit: Unit | None) -> P
     Nothing is looked up unless programs are kept, see `kmn_jax.programs`; a card is read as it is.
     """
     folder = kept_folder()
-    if folder is None or source.suffix.lower() == ".kmn" or not source.is_file():
-        return estimator.prepare(source, unit)
-    if source.stat().st_size > _LONGEST:
+    is_card = source.suffix.lower() == ".kmn"
+    if folder is None or is_card or not source.is_file() or source.stat().st_size > _LONGEST:
         return estimator.prepare(source, unit)
     digest = hashlib.sha256(f"{source.name}\n{unit}\n{estimator.digest}\n".encode())
     with contextlib.suppress(OSError):  # then the reader says what is wrong
