@@ -184,7 +184,6 @@ def undecodable(path: Path) -> None:
     (path / "record.json").write_text(json.dumps(stored))
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # of threads of orbax, with their loop
 def test_what_orbax_cannot_decode_gives_way_to_the_one_before(two: Path, tmp_path: Path, like: TrainState) -> None:
     folder = shutil.copytree(two, tmp_path / "checkpoints")
     undecodable(folder / "step-00000020")
