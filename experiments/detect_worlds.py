@@ -21,10 +21,12 @@ from experiments.bins import LEAST_VISIBLE, WorldImage, world_images
 from experiments.calibrate import SHIPPED
 from experiments.detect_bins import CONFIG, Tally
 from experiments.reliability_picture import reliability_table, save_reliability
+from experiments.worst_images import WorstImages
 from kmn_jax.detection import (
     EVIDENCE,
     Detections,
     Probabilities,
+    Scene,
     Timing,
     detect,
     load_probabilities,
@@ -50,7 +52,8 @@ class Options:
     every: int = 1  # use every so many images
     strangers: bool = False  # also search all images for a part that is not there
     json: Path | None = None
-    picture: Path | None = None  # .png file for the reliability diagram
+    picture: Path | None = None  # .png file for the reliability diagrams
+    worst: Path | None = None  # folder for pictures of the three worst images of each family
 
 
 @dataclass
@@ -101,12 +104,16 @@ def run(options: Options) -> dict[str, Any]:
     model = load_pretrained() if options.model is None else load_model(options.model)
     fitted = load_probabilities(options.calibration, EVIDENCE)
     tallies: dict[str, WorldTally] = defaultdict(WorldTally)
+    worst = WorstImages(CONFIG.accepted)
     for image in tqdm(world_images(options.folder, model, options.every), unit="image"):
-        counted = Tally.of(image, _found(model, fitted, image.part, image.scan))
+        scene, found = _found(model, fitted, image.part, image.scan)
+        counted = Tally.of(image, found)
+        if scene is not None:
+            worst.add(image, scene, found, counted)
         for name in (image.family, _ALL):
             tallies[name].add(image, counted)
         if options.strangers and image.stranger is not None and len(image.truth):
-            found = _found(model, fitted, image.stranger, image.scan)
+            _, found = _found(model, fitted, image.stranger, image.scan)
             for name in (image.family, _ALL):
                 tallies[name].add_stranger(found)
     if not tallies:
@@ -120,17 +127,20 @@ def run(options: Options) -> dict[str, Any]:
     print_table("Reliability over all", curves[_ALL])
     results = {"detection": rows, "reliability": curves}
     write_json(options.json, results)
-    save_reliability({_ALL: curves[_ALL]}, options.picture)
+    save_reliability(curves, options.picture)
+    if options.worst is not None:
+        for path in worst.save(options.worst):
+            print(f"wrote {path}")
     return results
 
 
-def _found(model: Model, fitted: Probabilities, part: Part, scan: Scan) -> Detections:
+def _found(model: Model, fitted: Probabilities, part: Part, scan: Scan) -> tuple[Scene | None, Detections]:
     """Return what is found in a whole scan; nothing where it is refused, as one that shows a plane alone."""
     try:
         scene = make_scene(scan, part.diameter)
     except InputError as error:
-        return Detections(part.name, scan.unit, (), Timing({}, 0.0), str(error), ())
-    return detect(model, fitted, part, scene, 0, CONFIG)
+        return None, Detections(part.name, scan.unit, (), Timing({}, 0.0), str(error), ())
+    return scene, detect(model, fitted, part, scene, 0, CONFIG)
 
 
 if __name__ == "__main__":

@@ -14,8 +14,9 @@ from experiments.detect_bins import Tally
 from experiments.detect_worlds import WorldTally
 from experiments.test_sets import SPLIT
 from experiments.worlds import FAMILIES, TARGETS, VALIDATION, build_worlds, kind_of
+from experiments.worst_images import WorstImages
 from kmn_jax.bop import BopDataset
-from kmn_jax.detection import CropPrediction, Detection, Detections, Timing
+from kmn_jax.detection import CropPrediction, Detection, Detections, Timing, make_scene
 from kmn_jax.errors import InputError
 from kmn_jax.models import Model, load_pretrained
 
@@ -101,3 +102,20 @@ def test_counts(folder: Path, model: Model) -> None:
     assert row["average precision"] == pytest.approx(seen * (100 // copies + 1) / 101)
     assert row["shifted, mm, median"] == pytest.approx(0, abs=1e-3)
     assert row["turned, degrees, 90%"] == pytest.approx(0, abs=0.1)
+
+
+def test_the_worst_images_are_drawn(folder: Path, model: Model, tmp_path: Path) -> None:
+    images = list(world_images(folder, model))[:3]
+    worst, counts = WorstImages(accepted=0.5), [(1, 0.9, True), (3, 0.9, True), (1, 0.9, False)]
+    for image, (copies, probability, right) in zip(images, counts, strict=True):
+        nothing = Detections(image.part.name, "mm", (), Timing({}, 0.0), "nothing was found")
+        counted = Tally([probability], [right], [right], copies)
+        worst.add(image, make_scene(image.scan, image.part.diameter), nothing, counted)
+    # Nothing is wrong in the first; two of three copies are missed in the second, one in the third, which has a wrong
+    # pose besides.
+    drawn = worst.save(tmp_path / "worst")
+    assert [path.name for path in drawn] == [
+        "mixed_parts-000001-000001-2_missed-0_wrong.png",
+        "mixed_parts-000001-000002-1_missed-1_wrong.png",
+    ]
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in drawn)
