@@ -35,8 +35,15 @@ def image() -> Scan:
     return bop_scan(IMAGE)[0]
 
 
+def empty_depth() -> np.ndarray:
+    """The image's floor alone, as it lies in most columns of a row."""
+    depth = np.rint(image().depth)
+    return np.repeat(np.quantile(depth, 0.9, axis=1), depth.shape[1]).reshape(depth.shape).astype(np.uint16)
+
+
 GIVEN = {
     "depth": lambda: np.rint(image().depth).astype(np.uint16),
+    "empty_depth": lambda: empty_depth(),
     "K": lambda: image().camera.matrix,
     "T_base_camera": lambda: T_BASE_CAMERA,
     "cloud_in_robot_frame": lambda: (image().points @ T_BASE_CAMERA[:3, :3].T + T_BASE_CAMERA[:3, 3]).astype("f4"),

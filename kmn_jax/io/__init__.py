@@ -2,7 +2,7 @@
 
 from kmn_jax.io._depth_arrays import CameraMatrix, depth_array_scan
 from kmn_jax.io._images import ImageHeader, image_header, read_image
-from kmn_jax.io._meshes import MESH_SUFFIXES, check_triangles, read_file, read_mesh
+from kmn_jax.io._meshes import CLOUD_SUFFIXES, MESH_SUFFIXES, check_triangles, read_file, read_mesh
 from kmn_jax.io._origin import FAR, far_origin, held, object_origin
 from kmn_jax.io._poses import in_other_unit, pose_matrix, pose_of, read_pose
 from kmn_jax.io._scale import length_doubt, length_problem, resolve_unit, scene_size, size_question
@@ -10,6 +10,7 @@ from kmn_jax.io._scans import DepthCamera, Scan, depth_scan, read_scan
 from kmn_jax.io._stated import stated_unit
 
 __all__ = [
+    "CLOUD_SUFFIXES",
     "FAR",
     "MESH_SUFFIXES",
     "CameraMatrix",

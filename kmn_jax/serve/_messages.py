@@ -40,7 +40,8 @@ class PoseInfo(_Open):
 
     T_scene_object: _Matrix = Field(description="4 x 4, object to scene, lengths in the result's unit")
     probability: float = Field(ge=0, le=1)
-    inliers: int
+    num_inliers: int = Field(description="matches that agree on the pose")
+    inliers: int = Field(description="the same as `num_inliers`")
     visible_fraction: float
     runner_up_gap: float
     explained: float
@@ -49,6 +50,8 @@ class PoseInfo(_Open):
     unknown: float
     seed: list[float] = Field(description="the point of the scan that was searched around", min_length=3, max_length=3)
     warnings: list[str]
+    T_base_object: _Matrix | None = Field(description="null: the server knows no robot")
+    grasps: list[object] | None = Field(description="null, likewise")
 
 
 class TimingInfo(_Open):
