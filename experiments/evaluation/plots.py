@@ -11,6 +11,7 @@ import numpy as np
 from experiments.evaluation.configs import noise_name
 from experiments.evaluation.scores import Cell, pooled
 from kmn_jax.errors import InputError
+from kmn_jax.extras import install_command
 
 
 def recall_plot(cells: Sequence[Cell], noises: Sequence[float]) -> bytes:
@@ -69,7 +70,7 @@ def new_figure(size: tuple[float, float]) -> tuple[Any, Any]:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError:
-        raise InputError("reports need a package that is not installed: pip install 'kmn_jax[plots]'") from None
+        raise InputError(f"reports need a package that is not installed: {install_command('matplotlib')}") from None
     figure = Figure(figsize=size, layout="constrained", dpi=100)
     return figure, FigureCanvasAgg(figure)
 

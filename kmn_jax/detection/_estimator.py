@@ -38,6 +38,7 @@ from kmn_jax.io import (
 )
 from kmn_jax.models import Model, load_model, released_file
 from kmn_jax.objects import (
+    CARD_SUFFIX,
     ObjectConfig,
     Part,
     load_part,
@@ -50,7 +51,6 @@ from kmn_jax.units import Unit
 
 _UNFITTED = "the probabilities were fitted for other weights: fit them with experiments.calibrate"
 _OBJECT = ObjectConfig(num_points=4096)
-_CARD = ".kmn"
 _MOST_SEED = 2**32 - 1
 
 
@@ -91,7 +91,7 @@ class PoseEstimator:
         is that of its numbers, by default millimetres. Cards, STEP and GLB files state theirs: they are converted to
         `unit`, if it is given. Raises InputError if there is no surface in it.
         """
-        if isinstance(source, str | Path) and Path(source).suffix.lower() == _CARD:
+        if isinstance(source, str | Path) and Path(source).suffix.lower() == CARD_SUFFIX:
             part = load_part(source, self.digest)
             return part if unit is None else part.in_unit(unit)
         return make_part(object_of(source, unit, name, _OBJECT), self.model, self.digest)

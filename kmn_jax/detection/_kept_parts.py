@@ -8,7 +8,7 @@ from pathlib import Path
 
 from kmn_jax.detection._estimator import PoseEstimator
 from kmn_jax.errors import InputError
-from kmn_jax.objects import Part, load_part, save_part
+from kmn_jax.objects import CARD_SUFFIX, Part, load_part, save_part
 from kmn_jax.programs import kept_folder
 from kmn_jax.units import Unit
 
@@ -22,7 +22,7 @@ def prepare_kept(estimator: PoseEstimator, source: Path, unit: Unit | None) -> P
     Nothing is looked up unless programs are kept, see `kmn_jax.programs`; a card is read as it is.
     """
     folder = kept_folder()
-    is_card = source.suffix.lower() == ".kmn"
+    is_card = source.suffix.lower() == CARD_SUFFIX
     if folder is None or is_card or not source.is_file() or source.stat().st_size > _LONGEST:
         return estimator.prepare(source, unit)
     digest = hashlib.sha256(f"{source.name}\n{unit}\n{estimator.digest}\n".encode())

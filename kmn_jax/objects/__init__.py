@@ -2,10 +2,20 @@
 
 from kmn_jax.objects._grasps import Grasp, Grasps, Gripper, load_grasps
 from kmn_jax.objects._object_model import ObjectConfig, ObjectModel, load_object, object_from_cloud, object_from_mesh
-from kmn_jax.objects._part import Part, PartArrays, arrays_of, load_part, make_part, model_digest, save_part
+from kmn_jax.objects._part import (
+    CARD_SUFFIX,
+    Part,
+    PartArrays,
+    arrays_of,
+    load_part,
+    make_part,
+    model_digest,
+    save_part,
+)
 from kmn_jax.objects._symmetry import Symmetries
 
 __all__ = [
+    "CARD_SUFFIX",
     "Grasp",
     "Grasps",
     "Gripper",

@@ -24,6 +24,7 @@ from kmn_jax.objects._symmetry import Symmetries
 from kmn_jax.typing import Scalar
 from kmn_jax.units import METRES, check_unit
 
+CARD_SUFFIX = ".kmn"
 _FORMAT = "kmn_jax object card 1"
 _LIMIT = 1_000_000  # bytes of a card
 

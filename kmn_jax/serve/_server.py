@@ -18,14 +18,14 @@ import numpy as np
 from kmn_jax.detection import PoseEstimator
 from kmn_jax.errors import InputError, require
 from kmn_jax.io import CLOUD_SUFFIXES, MESH_SUFFIXES, Scan
-from kmn_jax.objects import Part
+from kmn_jax.objects import CARD_SUFFIX, Part
 from kmn_jax.serve._folder import private_folder
 from kmn_jax.serve._parts import PartStore, check_name
 from kmn_jax.serve._settings import ServeConfig
 from kmn_jax.serve._warm_up import PLACE, bracket, brackets_on_a_floor
 from kmn_jax.web import address, listen
 
-_PART_SUFFIXES = tuple(dict.fromkeys((*MESH_SUFFIXES, *CLOUD_SUFFIXES, ".kmn")))
+_PART_SUFFIXES = tuple(dict.fromkeys((*MESH_SUFFIXES, *CLOUD_SUFFIXES, CARD_SUFFIX)))
 _AFTER_LIMITS = 10.0  # s that answers are waited for once all limits have passed
 
 

@@ -11,9 +11,8 @@ from jaxtyping import Float, Int
 
 from kmn_jax.errors import InputError
 from kmn_jax.io import MESH_SUFFIXES, read_mesh
-from kmn_jax.objects import Part
+from kmn_jax.objects import CARD_SUFFIX, Part
 
-_CARD = ".kmn"
 _MOST_TRIANGLES = 20_000  # of a copy: more make pages slow
 
 
@@ -32,7 +31,7 @@ def part_mesh(source: str | Path, part: Part) -> PartMesh | None:
     """
     source = Path(source)
     files = [source]
-    if source.suffix.lower() == _CARD:
+    if source.suffix.lower() == CARD_SUFFIX:
         files = [path for path in sorted(source.parent.glob(f"{source.stem}.*")) if path.stem == source.stem]
     for path in files:
         if path.suffix.lower() not in MESH_SUFFIXES:
