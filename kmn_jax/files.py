@@ -19,7 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from kmn_jax.errors import InputError, shown
-from kmn_jax.limits import parse_json
+from kmn_jax.limits import check_bytes, parse_json
 
 if sys.platform != "win32":
     import fcntl
@@ -136,7 +136,15 @@ def safetensors_bytes(tensors: dict[str, np.ndarray], metadata: dict[str, str] |
 
 
 def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Return tensors and header of a .safetensors file, or raise InputError."""
+    """Return tensors and header of a .safetensors file, or raise InputError, also for one beyond the budget."""
+    try:
+        if Path(path).exists() and not Path(path).is_file():
+            raise InputError("it is not a regular file")
+        check_bytes(os.stat(path).st_size)
+    except InputError as error:
+        raise InputError(f"{path} cannot be used: {error}") from None
+    except (OSError, ValueError):
+        pass  # which is told below
     try:
         with safe_open(str(path), "np") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a mapping)

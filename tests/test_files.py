@@ -133,6 +133,19 @@ def test_what_cannot_be_written_is_told_before(tmp_path: Path) -> None:
             check_outputs((tmp_path / "other", target), source, tmp_path / ("b" * 300))
 
 
+def test_tensors_beyond_the_budget_and_pipes_are_not_read(tmp_path: Path) -> None:
+    with (tmp_path / "large").open("wb") as file:
+        file.truncate(2_000_000_001)  # without a byte on the disk
+    os.mkfifo(tmp_path / "pipe")  # nobody writes to it
+    for name, message in (
+        ("large", "takes 2000000001 bytes"),
+        ("pipe", "not a regular file"),
+        ("no", "not a readable"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_safetensors(tmp_path / name)
+
+
 def test_the_same_tensors_make_the_same_bytes(tmp_path: Path) -> None:
     tensors = {"b": np.arange(6.0).reshape(2, 3), "a": np.ones((0, 3), np.float32), "c": np.arange(3, dtype=np.uint8)}
     metadata = {name: f'"{name}" \u00fc\n' for name in "hgfedcba"}

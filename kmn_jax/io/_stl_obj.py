@@ -45,7 +45,9 @@ def _parse_text(text: bytes) -> Float64[np.ndarray, "t 3 3"]:
     if not text.rpartition(b"\n")[2].lstrip().lower().startswith(b"endsolid"):
         raise InputError("it is truncated: it does not end with 'endsolid'")
     # Whole facets of a whole file; a cut elsewhere only adds to what is wrong with another.
-    facets = [_parse_facets(piece.split()) for piece in pieces(_NAME.sub(b"", text).lower(), _END_FACET)]
+    text = _NAME.sub(b"", text).lower()
+    check_elements(3 * text.count(b"endfacet"))
+    facets = [_parse_facets(piece.split()) for piece in pieces(text, _END_FACET)]
     return np.concatenate([np.zeros((0, 3, 3)), *facets])
 
 
@@ -75,6 +77,8 @@ def parse_obj(content: bytes) -> tuple[Float64[np.ndarray, "v 3"], Int64[np.ndar
             if kind == b"v":
                 x, y, z = words[1:4]
                 coordinates.extend((float(x), float(y), float(z)))
+                if len(coordinates) > most:
+                    check_elements(len(coordinates) // 3)
             elif kind == b"f":
                 corners = [int(word.partition(b"/")[0]) for word in words[1:]]
                 if len(corners) < 3 or 0 in corners:
