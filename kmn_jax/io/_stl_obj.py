@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, shown
 from kmn_jax.io._text import pieces
 from kmn_jax.limits import check_elements, most_elements
 
@@ -58,7 +58,7 @@ def _parse_facets(words: list[bytes]) -> Float64[np.ndarray, "t 3 3"]:
     try:
         numbers = [list(map(float, column)) for name, column in columns if name == b"x"]
     except ValueError as error:
-        raise InputError(f"it is damaged: {str(error)[:80]}") from None
+        raise InputError(f"it is damaged: {shown(error, 80)}") from None
     return np.array(numbers, dtype=np.float64).T.reshape(-1, 3, 3)
 
 
@@ -92,8 +92,8 @@ def parse_obj(content: bytes) -> tuple[Float64[np.ndarray, "v 3"], Int64[np.ndar
         except InputError:
             raise
         except (ValueError, OverflowError):
-            shown = line.strip()[:60].decode("latin-1")
-            raise InputError(f"line {number} is not a {'vertex' if kind == b'v' else 'face'}: {shown!r}") from None
+            text = line.strip()[:60].decode("latin-1")
+            raise InputError(f"line {number} is not a {'vertex' if kind == b'v' else 'face'}: {text!r}") from None
     return np.array(coordinates, np.float64).reshape(-1, 3), np.array(triangles, np.int64).reshape(-1, 3)
 
 
