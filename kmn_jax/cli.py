@@ -16,7 +16,8 @@ from kmn_jax import __version__
 from kmn_jax.arguments import joined, parsed
 from kmn_jax.errors import InputError, number_list, require
 from kmn_jax.extras import install_command
-from kmn_jax.files import check_output, write_whole
+from kmn_jax.files import check_outputs, write_whole
+from kmn_jax.printing import drop_what_is_printed, open_closed_streams, say
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -87,13 +88,13 @@ def prepare(
     from kmn_jax.objects import save_part
 
     target = output or source.parent / f"{source.stem}.kmn"
-    check_output(target, source)
+    check_outputs((target,), source, Path(weights))
     part = PoseEstimator.from_pretrained(weights).prepare(source, _unit(units))
     save_part(part, target)
-    print(f"{describe(part)}; wrote {target}")
+    say(f"{describe(part)}; wrote {target}")
     question = size_question(part.diameter, part.unit, "--units")
     if question is not None:
-        print(f"note: {question}")
+        say(f"note: {question}")
 
 
 def detect(
@@ -118,10 +119,8 @@ def detect(
 
     if top is not None and top < 1:
         raise InputError(f"top is {top}, but must be at least 1")
-    for target in (json, bop_csv, save_picture):
-        if target is not None:
-            read = (request.camera, request.background, request.base_camera, request.grasps)
-            check_output(target, request.object, request.scene, *read)
+    read = (request.camera, request.background, request.base_camera, request.grasps, Path(request.weights))
+    check_outputs((json, bop_csv, save_picture), request.object, request.scene, *read)
     if save_picture is not None:
         from kmn_jax.viz import check_picture
 
@@ -145,9 +144,8 @@ def detect(
         draw(save_picture, session.scene, session.part, found, session.scene.truth)
     elif save_picture is not None:
         write_whole(save_picture, answer.picture)
-    print(table(found, DetectConfig().accepted))
-    for target in filter(None, (json, bop_csv, save_picture)):
-        print(f"wrote {target}")
+    written = [f"wrote {target}" for target in (json, bop_csv, save_picture) if target is not None]
+    say("\n".join([table(found, DetectConfig().accepted), *written]))
 
 
 def view(
@@ -168,7 +166,7 @@ def view(
     check_page(host, port)
     session = _Session(request)
     found = session.detect(session.places)
-    print(table(found, session.estimator.config.accepted))
+    say(table(found, session.estimator.config.accepted))
     with Viewer(
         session.scene,
         session.part,
@@ -179,7 +177,7 @@ def view(
         on_next=one_after_the_other(request.scene, session.go_on, request.background),
         mesh=part_mesh(request.object, session.part),
     ) as page:
-        print(f"open {page.url}; stop with Ctrl+C", flush=True)
+        say(f"open {page.url}; stop with Ctrl+C")
         page.wait()
 
 
@@ -214,7 +212,7 @@ def serve(
 
     require(bool(np.isfinite(max_megabytes)), f"--max-megabytes is {max_megabytes}, but must be finite")
     limits = ServeConfig(host, port, allow_host, int(1e6 * max_megabytes), max_queue, time_limit)
-    run(limits, weights, parts, example, camera, lambda url: print(f"serving on {url}; stop with Ctrl+C", flush=True))
+    run(limits, weights, parts, example, camera, lambda url: say(f"serving on {url}; stop with Ctrl+C"))
 
 
 def export(
@@ -237,12 +235,12 @@ def export(
     """
     from kmn_jax.detection import PoseEstimator, export_estimator
 
-    check_output(output, object)
+    check_outputs((output,), object, Path(weights))
     estimator = PoseEstimator.from_pretrained(weights)
     part = estimator.prepare(object, _unit(object_units))
     part = part.in_unit(_unit(units) or part.unit)
     size = export_estimator(estimator, part, output, points)
-    print(f"wrote {output}: {size / 1e6:.1f} MB, scans of up to {points} points in {part.unit}")
+    say(f"wrote {output}: {size / 1e6:.1f} MB, scans of up to {points} points in {part.unit}")
 
 
 def convert(
@@ -259,13 +257,13 @@ def convert(
     """
     from kmn_jax.models import is_model_file, load_model, load_released, save_model, save_released
 
-    check_output(target, source)
+    check_outputs((target,), source)
     model = load_model(source) if is_model_file(source) else load_released(source)
     if target.suffix == ".safetensors" and not released_names:
         save_model(model, target)
     else:
         save_released(model, target)
-    print(f"wrote {target}")
+    say(f"wrote {target}")
 
 
 def _ask(request: Request, server: str, top: int | None, picture: bool) -> ServerAnswer:
@@ -354,10 +352,11 @@ def _unit(units: Units) -> Unit | None:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line: 0 is success, 2 bad input (one sentence on stderr), 1 our own failure."""
     arguments = joined(sys.argv[1:] if arguments is None else arguments)
-    if arguments == ["--version"]:
-        print(f"kmn {__version__}")
-        return 0
+    open_closed_streams()
     try:
+        if arguments == ["--version"]:
+            say(f"kmn {__version__}")
+            return 0
         run = parsed(arguments, (prepare, detect, view, serve, export, convert))
         from kmn_jax.geometry import ask_for_fast_selection
         from kmn_jax.programs import keep_compiled
@@ -366,8 +365,8 @@ def main(arguments: list[str] | None = None) -> int:
         keep_compiled()
         run()
         sys.stdout.flush()
-    except BrokenPipeError:  # nobody reads on, as in `kmn detect ... | head -1`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # nobody reads on
+        drop_what_is_printed()
     except InputError as error:
         print(f"kmn: {error}", file=sys.stderr)
         return 2

@@ -10,6 +10,7 @@ import secrets
 import stat
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import BinaryIO
 
@@ -18,7 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from kmn_jax.errors import InputError, shown
-from kmn_jax.limits import parse_json
+from kmn_jax.limits import check_bytes, parse_json
 
 if sys.platform != "win32":
     import fcntl
@@ -37,12 +38,12 @@ def write_whole(path: str | Path, content: bytes) -> None:
     """
     target = Path(os.path.realpath(path))
     try:
-        mode = target.stat().st_mode if target.exists() else None
+        mode = os.stat(path).st_mode if os.path.exists(path) else None
         if mode is not None and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-            target.write_bytes(content)
+            Path(path).write_bytes(content)  # by its own name: pipes such as /dev/stdout have no other
             return
         _remove_left_over(target)
-        temporary = target.with_name(f".{target.name[:100]}.{secrets.token_hex(8)}")
+        temporary = target.with_name(f".{_start_of(target)}.{secrets.token_hex(8)}")
         try:
             with temporary.open("xb") as file:  # under the user's umask
                 lock(file)
@@ -59,7 +60,7 @@ def write_whole(path: str | Path, content: bytes) -> None:
 
 def _remove_left_over(target: Path) -> None:
     """Remove temporary files of a target that no process holds locked, or made just now and is about to lock."""
-    name = re.compile(rf"\.{re.escape(target.name[:100])}\.[0-9a-f]{{16}}")
+    name = re.compile(rf"\.{re.escape(_start_of(target))}\.[0-9a-f]{{16}}")
     with contextlib.suppress(OSError):  # another process may be as quick, and not every folder can be listed
         with os.scandir(target.parent) as entries:
             left = [entry for entry in entries if name.fullmatch(entry.name) and entry.is_file(follow_symlinks=False)]
@@ -68,6 +69,11 @@ def _remove_left_over(target: Path) -> None:
                 with open(entry.path, "rb") as file:
                     if lock(file):
                         os.unlink(entry.path)
+
+
+def _start_of(target: Path) -> str:
+    """Return as much of a target's name as leaves room for more: file systems count bytes."""
+    return os.fsdecode(os.fsencode(target.name)[:100])
 
 
 def lock(file: BinaryIO | int) -> bool:
@@ -81,17 +87,39 @@ def lock(file: BinaryIO | int) -> bool:
     return True
 
 
-def check_output(path: Path, *read: Path | None) -> None:
-    """Raise InputError if a file cannot be written, or is one of those that are `read`."""
+def check_outputs(paths: Iterable[Path | None], *read: Path | None) -> None:
+    """Raise InputError if a file cannot be written, is one of those that are `read`, or is to hold two results."""
+    named: set[str] = set()
+    for path in paths:
+        if path is None:
+            continue
+        try:
+            is_file = _check_place(path)
+        except OSError as error:
+            raise InputError(f"cannot write {path}: {error.strerror}") from None
+        sources = (source for source in read if source is not None and os.path.exists(source))
+        if os.path.exists(path) and any(os.path.samefile(source, path) for source in sources):
+            raise InputError(f"cannot write {path}: it is read, too, and would be lost; name another file")
+        target = os.path.realpath(path)
+        if is_file and target in named:
+            raise InputError(f"cannot write {path}: it is to hold another result, too; name another file")
+        named.add(target)
+
+
+def _check_place(path: Path) -> bool:
+    """Tell whether a path is that of a file, which may not exist, and not of a device or pipe.
+
+    Raises InputError or OSError if there can be none.
+    """
+    is_other = os.path.exists(path) and not (path.is_file() or path.is_dir())
     target = Path(os.path.realpath(path))
-    if not target.parent.is_dir():
+    if not is_other and not target.parent.is_dir():
         raise InputError(f"cannot write {path}: its folder does not exist")
     if target.is_dir():
         raise InputError(f"cannot write {path}: it is a folder")
-    if not os.access(target if target.exists() and not target.is_file() else target.parent, os.W_OK):
+    if not os.access(path if is_other else target.parent, os.W_OK):
         raise InputError(f"cannot write {path}: no permission")
-    if any(source is not None and source.exists() and target.exists() and source.samefile(target) for source in read):
-        raise InputError(f"cannot write {path}: it is read, too, and would be lost; name another file")
+    return not is_other
 
 
 def safetensors_bytes(tensors: dict[str, np.ndarray], metadata: dict[str, str] | None = None) -> bytes:
@@ -108,7 +136,15 @@ def safetensors_bytes(tensors: dict[str, np.ndarray], metadata: dict[str, str] |
 
 
 def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Return tensors and header of a .safetensors file, or raise InputError."""
+    """Return tensors and header of a .safetensors file, or raise InputError, also for one beyond the budget."""
+    try:
+        if Path(path).exists() and not Path(path).is_file():
+            raise InputError("it is not a regular file")
+        check_bytes(os.stat(path).st_size)
+    except InputError as error:
+        raise InputError(f"{path} cannot be used: {error}") from None
+    except (OSError, ValueError):
+        pass  # which is told below
     try:
         with safe_open(str(path), "np") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a mapping)

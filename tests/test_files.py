@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from kmn_jax.errors import InputError
-from kmn_jax.files import check_output, read_safetensors, safetensors_bytes, write_whole
+from kmn_jax.files import check_outputs, read_safetensors, safetensors_bytes, write_whole
 
 
 def test_file_appears_whole_and_replaces(tmp_path: Path) -> None:
@@ -60,6 +60,18 @@ def test_devices_and_pipes_are_written_to(tmp_path: Path) -> None:
     reader.join(timeout=20)
     assert got == [b"through"]
     assert [p.name for p in tmp_path.iterdir()] == ["pipe"]
+    read, write = os.pipe()  # which has no other name, as stdout and what shells substitute
+    check_outputs((Path(f"/dev/fd/{write}"),))
+    write_whole(f"/dev/fd/{write}", b"through")
+    assert os.read(read, 100) == b"through"
+    os.close(read)
+    os.close(write)
+
+
+def test_names_of_many_bytes_leave_room_for_what_stands_beside(tmp_path: Path) -> None:
+    path = tmp_path / ("\u90e8" * 85)
+    write_whole(path, b"whole")
+    assert path.read_bytes() == b"whole"
 
 
 def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
@@ -108,16 +120,30 @@ def test_what_cannot_be_written_is_told_before(tmp_path: Path) -> None:
     source = tmp_path / "part.stl"
     source.write_bytes(b"x")
     (tmp_path / "link").symlink_to(source)
-    check_output(tmp_path / "other", source, None, tmp_path / "none")
-    check_output(Path(os.devnull), source)
+    check_outputs((tmp_path / "other", None, Path(os.devnull), Path(os.devnull)), source, None, tmp_path / "none")
     for target, text in (
         (source, "read, too"),
         (tmp_path / "link", "read, too"),
         (tmp_path / "no" / "a", "its folder does not exist"),
         (tmp_path, "it is a folder"),
+        (tmp_path / ("a" * 300), "name too long"),
+        (tmp_path / ".." / tmp_path.name / "other", "another result, too"),
     ):
         with pytest.raises(InputError, match=text):
-            check_output(target, source)
+            check_outputs((tmp_path / "other", target), source, tmp_path / ("b" * 300))
+
+
+def test_tensors_beyond_the_budget_and_pipes_are_not_read(tmp_path: Path) -> None:
+    with (tmp_path / "large").open("wb") as file:
+        file.truncate(2_000_000_001)  # without a byte on the disk
+    os.mkfifo(tmp_path / "pipe")  # nobody writes to it
+    for name, message in (
+        ("large", "takes 2000000001 bytes"),
+        ("pipe", "not a regular file"),
+        ("no", "not a readable"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_safetensors(tmp_path / name)
 
 
 def test_the_same_tensors_make_the_same_bytes(tmp_path: Path) -> None:

@@ -185,7 +185,10 @@ def image_size(file: Path) -> tuple[int, int]:
 
 
 def read_depth(file: Path, factor: float) -> Float32[np.ndarray, "h w"]:
-    """Return a depth image times `factor`, with 0 where nothing was measured: 0, saturated, negative or not finite."""
+    """Return a depth image times `factor`, with 0 where nothing was measured: 0, saturated, negative or not finite.
+
+    That is also what a factor makes of it which is too large for float32.
+    """
     (mode, kind, *_), values = _read_image(file)
     if mode not in _DEPTH_MODES or values.ndim != 2:
         raise BopFault(file, "", f"has {mode} pixels, but a depth image has one channel of 16 or 32 bits")
@@ -193,7 +196,9 @@ def read_depth(file: Path, factor: float) -> Float32[np.ndarray, "h w"]:
     measured = np.isfinite(depth) & (depth > 0)
     if mode.startswith("I;16") or kind == "PNG":
         measured &= depth != SATURATED
-    return np.where(measured, np.where(measured, depth, 0) * factor, 0).astype(np.float32)
+    with np.errstate(over="ignore"):
+        found = (np.where(measured, depth, 0) * factor).astype(np.float32)
+    return np.where(np.isfinite(found), found, np.float32(0))
 
 
 def read_mask(file: Path) -> Bool[np.ndarray, "h w"]:

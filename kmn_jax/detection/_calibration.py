@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, shown
 from kmn_jax.limits import parse_json
 
 _RIDGE = 3e-3  # on standardised weights: keeps them finite where the evidence separates right from wrong completely
@@ -192,7 +192,7 @@ def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
         stored = parse_json(Path(path).read_text(encoding="utf-8"))
         models = [_read(found) for found in (stored["found"], stored["refined"])]
     except (OSError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path} is not a readable calibration: {error}") from None
+        raise InputError(f"{path} is not a readable calibration: {shown(error)}") from None
     if any(model.names != tuple(names) for model in models):
         raise InputError(f"{path} is a calibration of other evidence: fit it again with experiments.calibrate")
     return Probabilities(*models)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import warnings
 
 import numpy as np
@@ -10,11 +11,13 @@ from jaxtyping import Float64
 
 from kmn_jax.errors import InputError, shown
 from kmn_jax.io._lzf import unpack_lzf
-from kmn_jax.io._text import parse_numbers
+from kmn_jax.io._text import parse_numbers, pieces
 from kmn_jax.limits import check_bytes, check_elements
 
 Cloud = tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"] | None]  # points, normals
 _KINDS = {"F": "f", "I": "i", "U": "u"}
+_END_LINE = re.compile(rb"[\r\n]")
+_LONGEST_PIECE = 3_000_000  # bytes: of a megabyte, and the rest of its last line
 
 
 def parse_xyz(content: bytes, with_normals: bool) -> Cloud:
@@ -23,7 +26,9 @@ def parse_xyz(content: bytes, with_normals: bool) -> Cloud:
     Further columns are not used. Raises InputError, without the file's name, that names the first bad line.
     """
     columns = 6 if with_normals else 3
-    check_elements(max(content.count(b"\n"), content.count(b"\r")), "lines")
+    lines = max(content.count(b"\n"), content.count(b"\r"))
+    check_elements(lines, "lines")
+    check_bytes(8 * _columns_of_text(content) * lines)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of no data
@@ -34,6 +39,18 @@ def parse_xyz(content: bytes, with_normals: bool) -> Cloud:
         raise InputError(f"it has {table.shape[1]} numbers a line, but {columns} are needed")
     table = table.reshape(-1, max(columns, table.shape[1]))
     return table[:, :3], table[:, 3:6] if with_normals else None
+
+
+def _columns_of_text(content: bytes) -> int:
+    """Return how many numbers the first line has, which all others must have, too."""
+    found = 0
+    for piece in pieces(content, _END_LINE):
+        if len(piece) > _LONGEST_PIECE:
+            raise InputError("it has a line of megabytes: it is damaged, or no table of points")
+        if not found:
+            rows = (line.partition(b"#")[0].split() for line in _END_LINE.split(piece))
+            found = next((len(row) for row in rows if row), 0)
+    return found
 
 
 @np.errstate(invalid="ignore")  # the conversion of a signalling NaN, which is found later

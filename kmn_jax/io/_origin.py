@@ -34,8 +34,7 @@ def object_origin(points: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3"]:
     if not size:
         return np.zeros(3)  # one place has no surface, wherever it is
     farthest = float(np.abs(origin).max())
-    too_coarse = np.spacing(np.float32(farthest)) > size / _STEPS
-    if farthest > _LOST * size or (too_coarse and bool((points.astype(np.float32) == points).all())):
+    if farthest > _LOST * size or _is_coarse(points, farthest, size):
         raise InputError(
             f"it lies {farthest:.3g} from the origin of its frame, but is only {size:.3g} large, and its coordinates"
             " have not enough digits for both: move it to the origin and export it again"
@@ -44,7 +43,24 @@ def object_origin(points: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3"]:
 
 
 def held(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Return the points of a scan in float32, or in float64 if most lie too far from the origin for that."""
+    """Return the points of a scan in float32, or in float64 if most lie too far from the origin for that.
+
+    Raises InputError, without the file's name, if their coordinates have lost the scan's shape.
+    """
     some = points[:: 1 + len(points) // _SAMPLE].astype(np.float64)
     low, high = np.percentile(some, _PERCENTILES, axis=0)
-    return points.astype(np.float64 if far_origin(low, high).any() else np.float32)
+    farthest, size = float(np.abs(far_origin(low, high)).max()), float(np.linalg.norm(high - low))
+    if not farthest:
+        return points.astype(np.float32)
+    if size and _is_coarse(some, farthest, size):
+        raise InputError(
+            f"its points lie {farthest:.3g} from the origin of their frame, but only {size:.3g} apart, and have not"
+            " enough digits for both: export it again nearer to the origin, or in double precision"
+        )
+    return points.astype(np.float64)
+
+
+def _is_coarse(points: Float[np.ndarray, "n 3"], farthest: float, size: float) -> bool:
+    """Tell whether points are in single precision, whatever holds them, and have few steps across their size."""
+    too_few = float(np.spacing(np.float32(farthest))) > size / _STEPS
+    return too_few and bool((points.astype(np.float32) == points).all())

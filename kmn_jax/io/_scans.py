@@ -184,7 +184,7 @@ def _npy(content: bytes) -> np.ndarray:
             if not all(type(size) is int for size in shape):
                 raise ValueError(f"shape {shape}")
     except Exception as error:  # of many kinds: the header is Python text
-        raise InputError(f"it is not a readable .npy file ({type(error).__name__}: {str(error)[:80]})") from None
+        raise InputError(f"it is not a readable .npy file ({type(error).__name__}: {shown(error, 80)})") from None
     if dtype.kind not in "fiu":
         raise InputError(f"it does not hold numbers, but {dtype.name} values")
     count = math.prod(shape)
@@ -215,7 +215,7 @@ def _npz(content: bytes) -> dict[str, np.ndarray]:
     except InputError:
         raise
     except Exception as error:  # of the archive, and of what unpacks it
-        raise InputError(f"it is not a readable .npz file ({type(error).__name__}: {str(error)[:80]})") from None
+        raise InputError(f"it is not a readable .npz file ({type(error).__name__}: {shown(error, 80)})") from None
     if not arrays.keys() & {"points", "depth"}:
         raise InputError(f"it holds {', '.join(names)[:80] or 'nothing'}, but neither points nor depth")
     return arrays

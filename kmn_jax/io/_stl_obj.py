@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, shown
 from kmn_jax.io._text import pieces
 from kmn_jax.limits import check_elements, most_elements
 
@@ -45,7 +45,9 @@ def _parse_text(text: bytes) -> Float64[np.ndarray, "t 3 3"]:
     if not text.rpartition(b"\n")[2].lstrip().lower().startswith(b"endsolid"):
         raise InputError("it is truncated: it does not end with 'endsolid'")
     # Whole facets of a whole file; a cut elsewhere only adds to what is wrong with another.
-    facets = [_parse_facets(piece.split()) for piece in pieces(_NAME.sub(b"", text).lower(), _END_FACET)]
+    text = _NAME.sub(b"", text).lower()
+    check_elements(3 * text.count(b"endfacet"))
+    facets = [_parse_facets(piece.split()) for piece in pieces(text, _END_FACET)]
     return np.concatenate([np.zeros((0, 3, 3)), *facets])
 
 
@@ -56,7 +58,7 @@ def _parse_facets(words: list[bytes]) -> Float64[np.ndarray, "t 3 3"]:
     try:
         numbers = [list(map(float, column)) for name, column in columns if name == b"x"]
     except ValueError as error:
-        raise InputError(f"it is damaged: {str(error)[:80]}") from None
+        raise InputError(f"it is damaged: {shown(error, 80)}") from None
     return np.array(numbers, dtype=np.float64).T.reshape(-1, 3, 3)
 
 
@@ -75,6 +77,8 @@ def parse_obj(content: bytes) -> tuple[Float64[np.ndarray, "v 3"], Int64[np.ndar
             if kind == b"v":
                 x, y, z = words[1:4]
                 coordinates.extend((float(x), float(y), float(z)))
+                if len(coordinates) > most:
+                    check_elements(len(coordinates) // 3)
             elif kind == b"f":
                 corners = [int(word.partition(b"/")[0]) for word in words[1:]]
                 if len(corners) < 3 or 0 in corners:
@@ -88,8 +92,8 @@ def parse_obj(content: bytes) -> tuple[Float64[np.ndarray, "v 3"], Int64[np.ndar
         except InputError:
             raise
         except (ValueError, OverflowError):
-            shown = line.strip()[:60].decode("latin-1")
-            raise InputError(f"line {number} is not a {'vertex' if kind == b'v' else 'face'}: {shown!r}") from None
+            text = line.strip()[:60].decode("latin-1")
+            raise InputError(f"line {number} is not a {'vertex' if kind == b'v' else 'face'}: {text!r}") from None
     return np.array(coordinates, np.float64).reshape(-1, 3), np.array(triangles, np.int64).reshape(-1, 3)
 
 

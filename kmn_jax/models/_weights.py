@@ -82,7 +82,7 @@ def load_model(path: str | Path) -> Model:
     problems += [
         f"{name} has values that are not finite numbers"
         for name in wanted
-        if name in tensors and not (tensors[name].dtype.kind in "fV" and np.isfinite(tensors[name]).all())
+        if name in tensors and not _are_finite(tensors[name])
     ]
     if problems:
         raise InputError(f"{path} does not fit its own config: {'; '.join(problems[:8])}")
@@ -90,3 +90,9 @@ def load_model(path: str | Path) -> Model:
         graphdef,
         nnx.from_flat_state({t: flat[t].replace(jax.device_put(tensors[name])) for name, t in wanted.items()}),
     )
+
+
+def _are_finite(values: np.ndarray) -> bool:
+    """Tell whether values are finite fractions, also in single precision, which all that is wider becomes."""
+    with np.errstate(over="ignore"):
+        return values.dtype.kind in "fV" and bool(np.isfinite(values.astype(np.float32)).all())

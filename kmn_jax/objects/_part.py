@@ -27,6 +27,7 @@ from kmn_jax.units import METRES, check_unit
 CARD_SUFFIX = ".kmn"
 _FORMAT = "kmn_jax object card 1"
 _LIMIT = 1_000_000  # bytes of a card
+_ROUNDING = 1e-3  # diameters by which float32 may move a point
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,16 @@ def make_part(found: ObjectModel, model: Model, digest: str | None = None) -> Pa
 
 
 def arrays_of(model: Model, part: Part) -> PartArrays:
-    """Return what a search needs of a part. Raises InputError if it must be `centred` first."""
+    """Return what a search needs of a part.
+
+    Raises InputError if it must be `centred` first, or if its features are not of the network's shape.
+    """
+    wanted = model.config.num_keypoints, model.config.object_width
+    if part.features.shape != wanted:
+        raise InputError(
+            f"{part.name} has features of the shape {part.features.shape}, but this network needs {wanted}: make it"
+            " again with kmn prepare"
+        )
     if part.origin.any():
         raise InputError(f"{part.name} lies too far from the origin of its frame for float32: take part.centred()")
     count = model.config.num_object_points
@@ -209,7 +219,9 @@ def _part(tensors: dict[str, np.ndarray], facts: dict[str, object]) -> Part:
         fits = value.ndim == len(shape) and all(
             size is None or size == found for size, found in zip(shape, value.shape, strict=True)
         )
-        if not fits or not np.isfinite(value).all():
+        with np.errstate(over="ignore"):
+            finite = np.isfinite(value).all() and np.isfinite(value.astype(np.float32)).all()
+        if not fits or not finite:
             raise ValueError(f"{name} has shape {value.shape} or values that are not finite")
         return value
 
@@ -232,12 +244,22 @@ def _part(tensors: dict[str, np.ndarray], facts: dict[str, object]) -> Part:
     minimum, maximum = (array(name, 3).astype(np.float64) for name in ("minimum", "maximum"))
     if not (minimum <= maximum).all():
         raise ValueError(f"minimum {minimum.tolist()} above maximum {maximum.tolist()}")
+    diameter, extents = number("diameter"), maximum - minimum
+    if not 0.99 * extents.max() <= diameter <= 1.01 * float(np.linalg.norm(extents)):
+        raise ValueError(f"a diameter of {diameter:g} in a box of {extents.tolist()}")
+    margin = _ROUNDING * diameter
+    if not ((points >= minimum - margin) & (points <= maximum + margin)).all():
+        raise ValueError("points outside of its box")
     rotations = array("symmetry_rotations", None, 3, 3).astype(np.float64)
     if not len(rotations):
         raise ValueError("no symmetry, not even the identity")
+    axes = array("symmetry_axes", None, 3).astype(np.float64)
+    products = rotations.transpose(0, 2, 1) @ rotations
+    if not np.allclose(products, np.eye(3), atol=1e-3) or not np.allclose(np.linalg.norm(axes, axis=1), 1, atol=1e-3):
+        raise ValueError("symmetries that are no rotations")
     symmetries = Symmetries(
         rotations,
-        array("symmetry_axes", None, 3).astype(np.float64),
+        axes,
         array("symmetry_center", 3).astype(np.float64),
         number("symmetry_tolerance"),
     )
@@ -247,7 +269,7 @@ def _part(tensors: dict[str, np.ndarray], facts: dict[str, object]) -> Part:
         points=points,
         normals=normals,
         features=features,
-        diameter=number("diameter"),
+        diameter=diameter,
         minimum=minimum,
         maximum=maximum,
         area=number("area"),

@@ -140,3 +140,9 @@ def test_broken_files_are_named(image: Path) -> None:
     (image.parents[1] / "scene_gt.json").write_text("{")
     with pytest.raises(InputError, match=r"scene_gt.json is not valid JSON"):
         bop_scan(image.with_name("000000.png"))
+
+
+def test_a_scale_beyond_float32_measures_nothing(image: Path) -> None:
+    edit_json(image.parents[1] / "scene_camera.json", "1", "depth_scale", value=1e300)
+    with pytest.raises(InputError, match=r"none of its .* pixels was measured"):
+        bop_scan(image)

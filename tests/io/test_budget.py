@@ -285,6 +285,29 @@ def test_obj_polygons_of_many_corners(tmp_path: Path, monkeypatch: pytest.Monkey
         monkeypatch.delenv(SETTING, raising=False)
 
 
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.obj", b"v 0 0 0\n" * 30_000 + b"f 1 2 3\n"),
+        ("a.stl", b"solid a\n" + b"facet normal 0 0 1 outer loop" + b" vertex 0 0 0" * 3 + b" endloop endfacet\n"),
+        ("a.xyz", (b"1 2 3" + b" 1" * 500 + b"\n") * 500),
+    ],
+)
+def test_text_that_is_short_for_what_it_holds(
+    name: str, content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if name == "a.stl":
+        head, _, facet = content.partition(b"\n")
+        content = head + b"\n" + facet * 9000 + b"endsolid a\n"
+    monkeypatch.setenv(SETTING, "1000000")
+    with pytest.raises(InputError, match=r"it (has|takes) \d+ (points|bytes), more than"):
+        read_mesh(written(tmp_path, name, content))
+
+
+def test_a_table_of_one_line(tmp_path: Path) -> None:
+    refused(written(tmp_path, "a.xyz", b"1 " * 2_000_000), "it has a line of megabytes")
+
+
 def test_pcd_that_unpacks_to_more_than_it_says(tmp_path: Path) -> None:
     header = (
         "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA binary_compressed\n"

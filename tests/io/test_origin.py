@@ -60,3 +60,11 @@ def test_long_coordinates_are_shown_to_a_tenth_of_a_millimetre() -> None:
     assert place_text(np.array([0.123456, 12.3456, 0]), "m") == ["0.1235", "12.35", "0"]
     assert place_text(np.array([12.34567, 5.4e6 + 0.1234, 0]), "m") == ["12.3457", "5400000.1234", "0.0000"]
     assert place_text(np.array([-123456.78, 0, 0]), "mm")[0] == "-123456.8"
+
+
+def test_scans_that_have_lost_their_shape_are_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "far.npy", (CLOUD + 1e6).astype(np.float32))
+    with pytest.raises(InputError, match=r"far\.npy cannot be used: its points .* have not enough digits for both"):
+        read_scan(tmp_path / "far.npy", "m")
+    same = np.full((5, 3), 1e6)  # one place has all its digits
+    np.testing.assert_array_equal(held(same), same)

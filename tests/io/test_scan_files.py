@@ -117,6 +117,12 @@ def test_intrinsics_may_be_in_the_file_or_a_matrix(tmp_path: Path) -> None:
         ("scan.ply", b"solid", "cannot be used"),
         ("scan.npy", b"\x93NUMPY", "not a readable .npy file"),
         pytest.param("scan.pcd", PCD, r"data type '<f9{99,111}\.\.\.\)$", id="long word"),
+        pytest.param(
+            "scan.npy",
+            b"\x93NUMPY\1\0\x30\x75" + b" " * 30_000,
+            r"^[^\n]*is not a readable .npy file[^\n]*large[^\n]*\Z",
+            id="words of two lines",
+        ),
         ("scan.npz", b"PK", "not a readable .npz file"),
         ("scan.png", b"\x89PNG", "not a readable image"),
         ("scan.png", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", "not a readable image"),

@@ -65,10 +65,11 @@ def test_weights_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
     save_model(create_model(TINY, jax.random.key(0)), path)
     with safe_open(str(path), "np") as file:
         values, header = {name: file.get_tensor(name) for name in file.keys()}, file.metadata()  # noqa: SIM118
-    values[min(values)].reshape(-1)[0] = np.nan
-    save_file(values, path, metadata=header)
-    with pytest.raises(InputError, match=f"{min(values)} has values that are not finite numbers"):
-        load_model(path)
+    name = min(values)
+    for bad in (np.float32(np.nan), np.float64(1e300), np.int32(1)):  # 1e300 is infinite in single precision
+        save_file(values | {name: np.full_like(values[name], bad, dtype=bad.dtype)}, path, metadata=header)
+        with pytest.raises(InputError, match=f"{name} has values that are not finite numbers"):
+            load_model(path)
 
 
 def test_names_may_carry_the_data_parallel_prefix(tensors: dict[str, np.ndarray], torch_file: Path, tmp_path) -> None:

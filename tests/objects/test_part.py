@@ -13,7 +13,17 @@ from safetensors.numpy import load_file, save_file
 
 from kmn_jax.errors import InputError
 from kmn_jax.models import Model, create_model, load_model, save_model
-from kmn_jax.objects import ObjectConfig, ObjectModel, Part, load_object, load_part, make_part, model_digest, save_part
+from kmn_jax.objects import (
+    ObjectConfig,
+    ObjectModel,
+    Part,
+    arrays_of,
+    load_object,
+    load_part,
+    make_part,
+    model_digest,
+    save_part,
+)
 from tests.reference.networks import TINY
 
 STL = Path(__file__).parent.parent.parent / "experiments" / "assets" / "industrial" / "shaft.stl"
@@ -89,6 +99,11 @@ def test_a_card_of_other_weights_is_refused_with_what_renews_it(part: Part, tmp_
         ("symmetry_rotations", np.zeros((0, 3, 3))),
         ("minimum", None),
         ("minimum", np.full(3, 1e6)),
+        ("minimum", np.full(3, -1e6)),
+        ("features", np.full((8, 8), 1e300)),
+        ("points", np.full((256, 3), 1e30, np.float32)),
+        ("symmetry_rotations", np.zeros((1, 3, 3))),
+        ("symmetry_axes", np.zeros((1, 3))),
         ("unit", None),
     ],
 )
@@ -106,6 +121,13 @@ def test_a_damaged_card_is_refused(part: Part, tmp_path: Path, name: str, value:
     save_file(tensors, path, metadata=header)
     with pytest.raises(InputError, match="is a damaged object card"):
         load_part(path)
+
+
+@pytest.mark.parametrize("shape", [(8, 5), (4, 8)])
+def test_features_that_are_not_the_networks_are_refused(part: Part, model: Model, shape: tuple[int, int]) -> None:
+    assert arrays_of(model, part).features.shape == (8, 8)
+    with pytest.raises(InputError, match=r"but this network needs \(8, 8\): make it again with kmn prepare"):
+        arrays_of(model, replace(part, features=np.ones(shape, np.float32)))
 
 
 def test_what_is_no_card_is_refused(part: Part, tmp_path: Path) -> None:
