@@ -17,6 +17,7 @@ from typing import Any
 import jax
 
 from kmn_jax.errors import InputError
+from kmn_jax.files import check_outputs, write_whole
 
 
 def environment() -> dict[str, Any]:
@@ -62,18 +63,23 @@ def write_json(path: Path | None, results: Mapping[str, Any]) -> None:
     if path is None:
         return
     check_target(path)
-    path.write_text(json.dumps({"environment": environment(), **results}, indent=1, default=_plain) + "\n")
+    text = json.dumps({"environment": environment(), **results}, indent=1, default=_plain)
+    write_whole(path, f"{text}\n".encode())
     print(f"\nwrote {path}")
 
 
 def check_target(path: Path | None) -> None:
-    """Make the folder of a file that is to be written; call it before what takes time. Raises InputError."""
+    """Make the folder of a file that is to be written; call it before what takes time.
+
+    Raises InputError if the file cannot be written.
+    """
     if path is None:
         return
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot make the folder {path.parent}: {error.strerror}") from None
+    check_outputs((path,))
 
 
 def _plain(value: Any) -> Any:

@@ -12,7 +12,8 @@ import pytest
 
 from benchmarks.memory import run_apart
 from benchmarks.timing import Ceilings, compile_for, time_in_turn
-from kmn_jax.report import print_table, write_json
+from kmn_jax.errors import InputError
+from kmn_jax.report import check_target, print_table, write_json
 
 
 def test_compilation_is_apart_from_running() -> None:
@@ -64,3 +65,5 @@ def test_results_carry_their_environment(tmp_path: Path, capsys: pytest.CaptureF
     written = json.loads((tmp_path / "out" / "r.json").read_text())
     assert written["rows"] == [{"a": 1.0}]
     assert {"device", "versions", "commit", "date", "command"} <= written["environment"].keys()
+    with pytest.raises(InputError, match="cannot write"):
+        check_target(tmp_path / "out")  # before anything is measured
