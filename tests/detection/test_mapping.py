@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from kmn_jax.detection import call_rows, map_real, map_rows
+from kmn_jax.detection._mapping import only_if
+from tests.reference.devices import accelerator_forms
 
 
 class Pair(NamedTuple):
@@ -33,6 +35,23 @@ def test_rows_are_mapped_in_their_order_and_skipped_where_not_real() -> None:
     some = jax.jit(map_real, static_argnums=0)(one, real, values, keys)
     np.testing.assert_allclose(some.total, jnp.where(real[:, None], whole.total, 0))
     np.testing.assert_allclose(some.draw, jnp.where(real[:, None], whole.draw, 0), rtol=1e-6)
+
+
+def test_accelerators_are_given_no_choice_to_wait_for() -> None:
+    values, key = jnp.arange(3.0), jax.random.key(0)
+    found: dict[str, list[Pair]] = {
+        "here": [jax.jit(only_if, static_argnums=1)(real, one, values, key) for real in (True, False)]
+    }
+    with accelerator_forms():
+        program = jax.make_jaxpr(lambda real, *item: only_if(real, one, *item))(True, values, key)
+        assert "cond" not in str(program)
+        assert "select_n" in str(program)
+        found["there"] = [
+            jax.jit(lambda real, *item: only_if(real, one, *item))(real, values, key) for real in (True, False)
+        ]
+    for called, zeros in found.values():
+        jax.tree.map(np.testing.assert_array_equal, called, one(values, key))
+        jax.tree.map(lambda leaf: np.testing.assert_array_equal(leaf, 0), zeros)
 
 
 @pytest.mark.parametrize("count", [1, 2, 7])
