@@ -212,6 +212,8 @@ def read_entry(fields: dict[str, Any]) -> Entry:
 
 
 def _check_inside(path: str) -> None:
+    if "\0" in path:
+        raise InputError(f"path {shown(repr(path))} cannot be that of a file")
     if Path(path).is_absolute() or ".." in Path(path).parts:
         raise InputError(f"path {shown(repr(path))} leaves the pack")
 

@@ -191,7 +191,7 @@ def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
     try:
         stored = parse_json(Path(path).read_text(encoding="utf-8"))
         models = [_read(found) for found in (stored["found"], stored["refined"])]
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path} is not a readable calibration: {shown(error)}") from None
     if any(model.names != tuple(names) for model in models):
         raise InputError(f"{path} is a calibration of other evidence: fit it again with experiments.calibrate")
@@ -199,7 +199,7 @@ def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
 
 
 def _read(stored: dict[str, Any]) -> Calibration:
-    """Return a model of its JSON form. Raises KeyError, TypeError or ValueError if it is none."""
+    """Return a model of its JSON form. Raises KeyError, TypeError, ValueError or OverflowError if it is none."""
     names = tuple(str(name) for name in stored["names"])
 
     def numbers(name: str, count: int, given: Any = None) -> tuple[float, ...]:

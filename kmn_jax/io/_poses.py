@@ -43,7 +43,8 @@ def pose_of(values: Mapping[str, Any], name: str) -> Float64[np.ndarray, "4 4"]:
     if not {"xyz", "xyzw"} <= values.keys():
         raise InputError(f"it has no {name} (4 x 4 numbers), and no xyz with xyzw")
     place, quaternion = (finite_numbers(values[key], key, count) for key, count in (("xyz", 3), ("xyzw", 4)))
-    length = float(np.linalg.norm(quaternion))
+    with np.errstate(over="ignore"):
+        length = float(np.linalg.norm(quaternion))
     if not 0.99 < length < 1.01:
         raise InputError(f"xyzw has the length {length:.3g}, but must be a unit quaternion")
     x, y, z, w = quaternion / length

@@ -222,23 +222,25 @@ def _checked_record(path: Path) -> dict[str, Any]:
 def _read_arrays(path: Path, layout: dict[str, Any]) -> dict[str, np.ndarray]:
     import orbax.checkpoint as ocp
 
-    _check_blocks(path / _STATE)
+    _check_arrays(path / _STATE)
     arrays = {name: np.zeros(shape, jnp.dtype(dtype)) for name, (dtype, shape) in layout.items() if 0 in shape}
     wanted = {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in layout if name not in arrays}
     with _checkpointer() as checkpointer:
         return arrays | checkpointer.restore(path / _STATE, args=ocp.args.PyTreeRestore(restore_args=wanted))
 
 
-def _check_blocks(path: Path) -> None:
-    """Raise any error if what orbax is going to read cannot be read.
+def _check_arrays(path: Path) -> None:
+    """Raise any error if an array that orbax is going to read cannot be decoded.
 
-    It reads arrays side by side, and once one has failed, those that come later print tracebacks from its threads.
+    It reads them side by side, and once one has failed, those that come later print tracebacks from its threads.
     """
     import tensorstore
 
-    store = tensorstore.KvStore.open({"driver": "ocdbt", "base": f"{path.as_uri()}/"}).result()
-    for key in store.list().result():
-        store.read(key).result()
+    place = {"driver": "ocdbt", "base": f"{path.as_uri()}/"}
+    for key in tensorstore.KvStore.open(place).result().list().result():
+        folder, _, name = key.decode().rpartition("/")
+        if name == ".zarray":
+            tensorstore.open({"driver": "zarr", "kvstore": {**place, "path": f"{folder}/"}}).result().read().result()
 
 
 def _checkpointer() -> Any:

@@ -60,7 +60,7 @@ def add_metrics(folder: Path, row: Row) -> None:
 
 
 def read_metrics(folder: str | Path) -> list[dict[str, Any]]:
-    """Return the rows of a run's `metrics.jsonl`, without lines that were half written; none if there is no file."""
+    """Return the rows of a run's `metrics.jsonl`, without lines that are damaged; none if there is no file."""
     path = Path(folder) / _LINES
     if not path.exists():
         return []
@@ -70,9 +70,13 @@ def read_metrics(folder: str | Path) -> list[dict[str, Any]]:
             row = parse_json(line)
         except ValueError:
             continue
-        if isinstance(row, dict) and isinstance(row.get("step"), int):
+        if isinstance(row, dict) and isinstance(row.get("step"), int) and all(map(_is_metric, row.values())):
             rows.append(row)
     return rows
+
+
+def _is_metric(value: Any) -> bool:
+    return value is None or isinstance(value, str | int) or (isinstance(value, float) and math.isfinite(value))
 
 
 def write_config(folder: Path, config: Mapping[str, Any]) -> None:

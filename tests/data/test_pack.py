@@ -179,6 +179,7 @@ def edit_manifest(folder: Path, change: Callable[[dict], object]) -> None:
         (lambda m: m["objects"][1].update(split="all"), "split 'all' is not one of"),
         (lambda m: m["objects"][1]["objects"].update(path="../../secret"), "leaves the pack"),
         (lambda m: m["objects"][1]["objects"].update(path="/etc/passwd"), "leaves the pack"),
+        (lambda m: m["objects"][1]["objects"].update(path="\0"), "cannot be that of a file"),
         (lambda m: m["objects"][1].update(objects=None), "is broken"),
         (lambda m: m["objects"].append(3), "is broken"),
     ],

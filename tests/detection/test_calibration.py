@@ -108,6 +108,7 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
         "{}",
         '{"found": 1, "refined": {"names": ["first"], "weights": ["x"], "bias": 0}}',
         _damaged(fitted),
+        probabilities_bytes(fitted).decode().replace("-2.5", f"1{'0' * 400}"),
     ):
         path.write_text(content)
         with pytest.raises(InputError, match="not a readable calibration"):

@@ -104,6 +104,7 @@ def test_a_pose_is_read_in_all_forms(content: Any, unit: str | None, tmp_path: P
         (json.dumps((2 * POSE).tolist()), "is not a rigid pose"),
         (json.dumps(POSE[:3].tolist()), r"has shape \(3, 4\)"),
         ('{"xyz": [1, 2, 3], "xyzw": [0, 0, 0, 2]}', "xyzw has the length 2, but must be a unit quaternion"),
+        ('{"xyz": [1, 2, 3], "xyzw": [0, 0, 0, 1e200]}', "xyzw has the length inf"),
         ('{"xyz": [1, 2], "xyzw": [0, 0, 0, 1]}', "xyz must be 3 finite numbers"),
         (json.dumps({"T_base_camera": POSE.tolist(), "unit": "ft"}), "unit 'ft' is not known"),
         (

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -9,6 +11,7 @@ from pathlib import Path
 import jax
 import ml_dtypes
 import numpy as np
+import tensorstore
 
 from kmn_jax.data import BatchIterator, PipelineConfig, SampleBatches
 from kmn_jax.models import KeyMatchNetConfig, create_model
@@ -88,3 +91,30 @@ def truncate(path: Path) -> None:
 
 
 DAMAGES: dict[str, Callable[[Path], None]] = {"flip": flip, "truncate": truncate, "delete": Path.unlink}
+
+
+def reversed_manifest(checkpoint: Path) -> Path:
+    """Break the list of what a checkpoint's arrays are made of, and return its file."""
+    path = checkpoint / "state" / "manifest.ocdbt"
+    path.write_bytes(path.read_bytes()[::-1])
+    return path
+
+
+def reversed_chunk(checkpoint: Path) -> Path:
+    """Break the largest compressed piece of an array, and return the file that it is in."""
+    place = {"driver": "ocdbt", "base": f"{(checkpoint / 'state').as_uri()}/"}
+    store = tensorstore.KvStore.open(place).result()
+    values = [store.read(key).result().value for key in store.list().result() if not key.endswith(b".zarray")]
+    chunk = max(values, key=len)
+    path = next(path for path in checkpoint.rglob("*") if path.is_file() and chunk in path.read_bytes())
+    path.write_bytes(path.read_bytes().replace(chunk, chunk[::-1]))
+    return path
+
+
+def sign_again(checkpoint: Path, changed: Path) -> None:
+    """Write the digest of a file that was changed into its checkpoint."""
+    record = checkpoint / "record.json"
+    content = json.loads(json.loads(record.read_text())["content"])
+    content["files"][str(changed.relative_to(checkpoint))] = hashlib.sha256(changed.read_bytes()).hexdigest()
+    text = json.dumps(content)
+    record.write_text(json.dumps({"sha256": hashlib.sha256(text.encode()).hexdigest(), "content": text}))

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import shutil
 import signal
@@ -30,6 +28,9 @@ from tests.train.snapshot_sample import (
     mixed_state,
     random_snapshot,
     random_state,
+    reversed_chunk,
+    reversed_manifest,
+    sign_again,
 )
 
 ROOT = Path(__file__).parents[2]
@@ -173,20 +174,12 @@ def test_broken_folders(two: Path, tmp_path: Path, like: TrainState, damage: Cal
     assert_same(Checkpoints(folder).latest(like), random_snapshot(15, like))
 
 
-def undecodable(path: Path) -> None:
-    """Break a checkpoint's arrays, with the digests of what is then there."""
-    broken = files_by_kind(path)["state/manifest.ocdbt"]
-    broken.write_bytes(broken.read_bytes()[::-1])
-    content = json.loads(json.loads((path / "record.json").read_text())["content"])
-    content["files"][str(broken.relative_to(path))] = hashlib.sha256(broken.read_bytes()).hexdigest()
-    text = json.dumps(content)
-    stored = {"sha256": hashlib.sha256(text.encode()).hexdigest(), "content": text}
-    (path / "record.json").write_text(json.dumps(stored))
-
-
-def test_what_orbax_cannot_decode_gives_way_to_the_one_before(two: Path, tmp_path: Path, like: TrainState) -> None:
+@pytest.mark.parametrize("damage", [reversed_manifest, reversed_chunk])
+def test_what_orbax_cannot_decode_gives_way(
+    two: Path, tmp_path: Path, like: TrainState, damage: Callable[[Path], Path]
+) -> None:
     folder = shutil.copytree(two, tmp_path / "checkpoints")
-    undecodable(folder / "step-00000020")
+    sign_again(folder / "step-00000020", damage(folder / "step-00000020"))
     reports: list[str] = []
     checkpoints = Checkpoints(folder, report=reports.append)
     assert_same(checkpoints.latest(like), random_snapshot(10, like))
@@ -198,7 +191,7 @@ def test_what_orbax_cannot_decode_gives_way_to_the_one_before(two: Path, tmp_pat
 def test_if_none_can_be_decoded_all_stay(two: Path, tmp_path: Path, like: TrainState) -> None:
     folder = shutil.copytree(two, tmp_path / "checkpoints")
     for name in ("step-00000010", "step-00000020"):
-        undecodable(folder / name)
+        sign_again(folder / name, reversed_manifest(folder / name))
     with pytest.raises(InputError, match=r"step-00000020 is as it was written, but cannot be decoded"):
         Checkpoints(folder, report=lambda _: None).latest(like)
     assert Checkpoints(folder).steps == [10, 20]

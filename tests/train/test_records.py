@@ -12,6 +12,7 @@ def test_rows_are_kept_up_to_where_a_run_goes_on(tmp_path: Path) -> None:
     for split, step in rows:
         add_metrics(tmp_path, {"step": step, "split": split, "loss": 1 / 3})
     with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 4, "split": "train", "loss": [NaN]}\n{"step": 4, "split": "train", "loss": 1e999}\n')
         file.write('{"step": 2, "spl')
     # The run was saved at step 4, before the validation there.
     for _ in range(2):
