@@ -219,7 +219,7 @@ def _state() -> TrainState:
 
 
 def assert_same_tensors(path: Path, other: Path) -> None:
-    """Compare all of two safetensors files but clocks, and the commit: this run's own results make files differ from it."""
+    """Compare all of two safetensors files but clocks, and the commit: what this writes makes files differ from it."""
     (found, facts), (wanted, wanted_facts) = read_safetensors(path), read_safetensors(other)
     assert facts | {"commit": ""} == wanted_facts | {"commit": ""}, f"{path.name}: other facts"
     assert found.keys() == wanted.keys()
