@@ -58,7 +58,7 @@ def read_poses(path: Path) -> Float[np.ndarray, "i 4 4"]:
     try:
         text = path.read_text(encoding="utf-8")
         numbers = _from_json(json.loads(text)) if path.suffix.lower() == ".json" else _from_text(text)
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(f"{path} holds no poses that can be read ({str(error)[:80]})") from None
     if numbers.ndim != 3 or numbers.shape[1:] != (4, 4) or not len(numbers):
         raise InputError(f"{path} holds numbers of shape {numbers.shape}, but must hold matrices of 4 x 4")

@@ -202,4 +202,5 @@ def _record(fields: dict[str, Any]) -> Record:
     record = Record(**{**fields, "entry": read_entry(entry) if entry else None})
     if not all(isinstance(text, str) for text in (record.name, record.split, record.reason or "")):
         raise TypeError("a name, split or reason is no text")
+    json.dumps(fields, allow_nan=False)  # ValueError for numbers that are not finite
     return record

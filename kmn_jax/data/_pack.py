@@ -284,12 +284,16 @@ def _decode(tensors: dict[str, np.ndarray], metadata: dict[str, str], path: Path
                 Bin(*tensors["bins"][index].tolist()), poses[end - copies : end], camera, T_camera_bin[index]
             )
             drops.append(Drop(scene))
+        points = (tensors["surfel_positions"] * (facts["half"] / _LEVELS) + middle).astype(np.float32)
+        numbers = (points, poses, T_camera_bin, tensors["views"], tensors["bins"], facts["diameter"], facts["area"])
+        if not all(np.isfinite(values).all() for values in numbers):
+            raise ValueError("values that are not finite")
         return PackedObject(
             name=facts["name"],
             split=facts["split"],
             diameter=facts["diameter"],
             area=facts["area"],
-            points=(tensors["surfel_positions"] * (facts["half"] / _LEVELS) + middle).astype(np.float32),
+            points=points,
             normals=_from_octahedral(tensors["surfel_normals"]),
             drops=tuple(drops),
             digest=facts["digest"],

@@ -228,7 +228,7 @@ def _cloud(points: np.ndarray, normals: np.ndarray | None, unit: str) -> Scan:
         points, normals = points[..., :3], points[..., 3:]
     rows = points[..., :3].reshape(-1, 3)
     check_elements(len(rows))
-    if normals is not None and normals.reshape(-1, 3).shape != rows.shape:
+    if normals is not None and (normals.shape[-1:] != (3,) or normals.reshape(-1, 3).shape != rows.shape):
         raise InputError(f"its normals have shape {normals.shape}, but its points {points.shape}")
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         single = rows.astype(np.float32)

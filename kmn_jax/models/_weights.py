@@ -73,7 +73,7 @@ def load_model(path: str | Path) -> Model:
     flat = dict(nnx.to_flat_state(parameters))
     wanted = {".".join(map(str, target)): target for target in flat}
     problems = [f"{name} is missing" for name in wanted if name not in tensors]
-    problems += [f"{name} is unknown" for name in tensors if name not in wanted]
+    problems += [f"{shown(name)} is unknown" for name in tensors if name not in wanted]
     problems += [
         f"{name} has shape {tensors[name].shape}, but the network needs {flat[target].shape}"
         for name, target in wanted.items()

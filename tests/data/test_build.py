@@ -158,7 +158,9 @@ def test_refuses_what_cannot_be_built_before_it_starts(tmp_path: Path) -> None:
     _Journal(journal, CONFIG)
     begin = journal.read_bytes()
     other = b'{"name": ["a"], "split": "train", "seconds": 1, "reason": "b", "entry": null}'
-    for content in (b"nonsense", *(begin + row for row in (b"3", b"{}", b'{"entry": 3}', b'{"entry": null}', other))):
+    endless = other.replace(b'["a"]', b'"a"').replace(b"1", b"NaN")
+    rows = (b"3", b"{}", b'{"entry": 3}', b'{"entry": null}', other, endless)
+    for content in (b"nonsense", *(begin + row for row in rows)):
         journal.write_bytes(content + b"\n")
         with pytest.raises(InputError, match=r"journal\.jsonl is damaged"):
             build_pack(tmp_path / "pack", sources, CONFIG)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from kmn_jax.data import Pack, PackedObject
 from kmn_jax.data._pack import Drop, quantised, write_manifest, write_object
 from kmn_jax.errors import InputError
+from kmn_jax.files import read_safetensors, safetensors_bytes
 from kmn_jax.geometry import Camera
 from kmn_jax.simulate import Bin, BinScene
 
@@ -161,6 +163,17 @@ def test_names_a_damaged_file_and_keeps_the_rest(
     assert len(pack.load("Family/part_1,0").drops) == 3
     if kind == "visibility":
         assert len(pack.load("Family/other", visibility=False).drops) == 3
+
+
+def test_refuses_what_is_not_finite(pack: Pack) -> None:
+    path = pack.folder / "objects/Family/other.safetensors"
+    tensors, facts = read_safetensors(path)
+    tensors["cameras"][0, 4] = np.nan
+    path.write_bytes(safetensors_bytes(tensors, facts))
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    edit_manifest(pack.folder, lambda manifest: manifest["objects"][1]["objects"].update(sha256=digest))
+    with pytest.raises(InputError, match=r"other.safetensors is not an object of a pack .*not finite"):
+        Pack(pack.folder).load("Family/other")
 
 
 def edit_manifest(folder: Path, change: Callable[[dict], object]) -> None:

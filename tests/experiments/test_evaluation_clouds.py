@@ -48,6 +48,7 @@ def test_poses_are_read_from_text_and_json(tmp_path: Path, name: str) -> None:
         ("a.json", '{"poses": [{"pose": 1}]}'),
         ("a.json", '{"poses": 3}'),
         ("a.json", "[[1, 2], [3]]"),
+        ("a.json", f"[[[1{'0' * 400}]]]"),
     ],
 )
 def test_what_is_no_pose_is_refused_with_the_file(tmp_path: Path, name: str, content: str) -> None:

@@ -156,6 +156,9 @@ def test_wrong_arrays_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "scan.npz", other=np.zeros(3))
     with pytest.raises(InputError, match="it holds other, but neither points nor depth"):
         read_scan(tmp_path / "scan.npz", "mm")
+    np.savez(tmp_path / "scan.npz", points=POINTS, normals=np.ones((len(POINTS), 1)))
+    with pytest.raises(InputError, match="its normals have shape"):
+        read_scan(tmp_path / "scan.npz", "mm")
 
 
 def test_pictures_and_missing_cameras_are_refused(tmp_path: Path) -> None:
