@@ -115,12 +115,13 @@ def detect(
         save_picture: file for a picture of scene, segmentation, keypoints and poses (PNG).
         server: address of a kmn serve that searches instead of this process.
     """
+    from kmn_jax.bop import bop_files
     from kmn_jax.detection import DetectConfig, as_json, table, write_bop_csv, write_json
 
     if top is not None and top < 1:
         raise InputError(f"top is {top}, but must be at least 1")
     read = (request.camera, request.background, request.base_camera, request.grasps, Path(request.weights))
-    check_outputs((json, bop_csv, save_picture), request.object, request.scene, *read)
+    check_outputs((json, bop_csv, save_picture), request.object, request.scene, *read, *bop_files(request.scene))
     if save_picture is not None:
         from kmn_jax.viz import check_picture
 

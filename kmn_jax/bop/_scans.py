@@ -55,6 +55,16 @@ def bop_scan(path: str | Path, unit: str = "mm") -> tuple[Scan, tuple[BopInstanc
         raise InputError(f"{path} cannot be used: {error}") from None
 
 
+def bop_files(path: str | Path) -> tuple[Path, ...]:
+    """Return the files that are read with an image of a BOP scene; none for another scan."""
+    place = _scene_of(Path(path))
+    if place is None:
+        return ()
+    folder, sensor = place
+    named = [folder / of_sensor(name, sensor, ".json") for name in ("scene_camera", "scene_gt")]
+    return (*named, folder.parent.parent / "models" / "models_info.json")
+
+
 def bop_scene_id(path: str | Path) -> int:
     """Return the number of an image's scene: the name of its folder, 0 if that is no number."""
     place = _scene_of(Path(path))

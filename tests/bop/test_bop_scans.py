@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kmn_jax.bop import BopDataset, bop_scan, bop_scene_id, bop_sizes, is_bop_image
+from kmn_jax.bop import BopDataset, bop_files, bop_scan, bop_scene_id, bop_sizes, is_bop_image
+from kmn_jax.cli import main
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import measured_points
 from tests.bop.bop_sample import edit_json, sample_frame, save_image, write_blenderproc, write_sample
@@ -146,3 +147,15 @@ def test_a_scale_beyond_float32_measures_nothing(image: Path) -> None:
     edit_json(image.parents[1] / "scene_camera.json", "1", "depth_scale", value=1e300)
     with pytest.raises(InputError, match=r"none of its .* pixels was measured"):
         bop_scan(image)
+
+
+@pytest.mark.parametrize("name", ["scene_camera.json", "scene_gt.json"])
+def test_no_output_replaces_what_an_image_is_read_with(
+    image: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = image.parent.parent / name
+    content = file.read_bytes()
+    assert main(["detect", "--object", "part.stl", "--scene", str(image), "--json", str(file)]) == 2
+    assert "it is read, too, and would be lost" in capsys.readouterr().err
+    assert file.read_bytes() == content
+    assert bop_files(image.with_name("cloud.ply")) == ()
