@@ -93,6 +93,11 @@ class PoseEstimator:
         """
         if isinstance(source, str | Path) and Path(source).suffix.lower() == CARD_SUFFIX:
             part = load_part(source, self.digest)
+            if part.num_keypoints != self.model.config.num_keypoints:
+                raise InputError(
+                    f"{source} has {part.num_keypoints} keypoints, not {self.model.config.num_keypoints}: make it again"
+                    " with kmn prepare"
+                )
             return part if unit is None else part.in_unit(unit)
         return make_part(object_of(source, unit, name, _OBJECT), self.model, self.digest)
 

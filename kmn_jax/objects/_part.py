@@ -148,13 +148,13 @@ def make_part(found: ObjectModel, model: Model, digest: str | None = None) -> Pa
 def arrays_of(model: Model, part: Part) -> PartArrays:
     """Return what a search needs of a part.
 
-    Raises InputError if it must be `centred` first, or if its features are not of the network's shape.
+    Raises InputError if it must be `centred` first, or if its features are not those of such a network.
     """
-    wanted = model.config.num_keypoints, model.config.object_width
-    if part.features.shape != wanted:
+    width = model.config.object_width
+    if part.features.shape[1:] != (width,):
         raise InputError(
-            f"{part.name} has features of the shape {part.features.shape}, but this network needs {wanted}: make it"
-            " again with kmn prepare"
+            f"{part.name} has features of the shape {part.features.shape}, but this network needs {width} for each"
+            " keypoint: make it again with kmn prepare"
         )
     if part.origin.any():
         raise InputError(f"{part.name} lies too far from the origin of its frame for float32: take part.centred()")
