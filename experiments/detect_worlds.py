@@ -108,7 +108,7 @@ def run(options: Options) -> dict[str, Any]:
     for image in tqdm(world_images(options.folder, model, options.every), unit="image"):
         scene, found = _found(model, fitted, image.part, image.scan)
         counted = Tally.of(image, found)
-        if scene is not None:
+        if options.worst is not None and scene is not None:
             worst.add(image, scene, found, counted)
         for name in (image.family, _ALL):
             tallies[name].add(image, counted)

@@ -17,7 +17,6 @@ _KEPT = 3  # images of a family
 
 @dataclass(frozen=True)
 class _Image:
-    faults: int
     missed: int
     wrong: int
     image: WorldImage
@@ -39,8 +38,8 @@ class WorstImages:
         missed = counted.copies - int((chosen & np.array(counted.hit, dtype=bool)).sum())
         if wrong + missed:
             family = self._kept.setdefault(image.family, [])
-            family.append(_Image(wrong + missed, missed, wrong, image, scene, found))
-            family.sort(key=lambda one: -one.faults)  # of equal ones, the first stay
+            family.append(_Image(missed, wrong, image, scene, found))
+            family.sort(key=lambda one: -(one.missed + one.wrong))  # of equal ones, the first stay
             del family[_KEPT:]
 
     def save(self, folder: Path) -> list[Path]:
