@@ -162,22 +162,24 @@ def _icp(
     num_scene = jnp.maximum(scene_mask.sum(dtype=jnp.int32), 1).astype(jnp.float32)
     gate = config.distance_gate
 
-    place = jnp.arange(scene.shape[0], dtype=jnp.int32)
     grouped = scene.shape[0] * model.shape[0] > _FEW_DISTANCES
     if grouped:
         groups, blocks = group_points(model, object_mask), group_points(scene, scene_mask)
         # The pose moves all scene points as one: blocks of them that lie together stay together.
-        place = (
-            jnp.zeros_like(place)
-            .at[jnp.where(blocks.mask, blocks.rows, scene.shape[0]).reshape(-1)]
-            .set(jnp.arange(blocks.rows.size, dtype=jnp.int32), mode="drop")
-        )
+        scene, normals, scene_mask = (array[blocks.rows.reshape(-1)] for array in (scene, normals, scene_mask))
+        scene_mask = scene_mask & blocks.mask.reshape(-1)
 
     def nearest_of_object(local: Points) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
         if not grouped:
             return nearest(local, model, object_mask)
-        rows, distances = nearest_within(local[blocks.rows], blocks.mask, groups, gate)
-        return rows.reshape(-1)[place], distances.reshape(-1)[place]
+        rows, distances = nearest_within(local.reshape(*blocks.mask.shape, 3), blocks.mask, groups, gate)
+        return rows.reshape(-1), distances.reshape(-1)
+
+    def in_order_given(mask: Bool[Array, " blocked"]) -> Mask:
+        if not grouped:
+            return mask
+        rows = jnp.where(blocks.mask, blocks.rows, scene_points.shape[0]).reshape(-1)
+        return jnp.zeros_like(scene_points[:, 0], dtype=bool).at[rows].set(mask, mode="drop")
 
     def residuals(pairs_moved: Points) -> Float[Array, " n"]:
         difference = pairs_moved - scene
@@ -204,7 +206,8 @@ def _icp(
             update = _plane_step(moved, normals, residual, weights)
             pose = compose(update, state.pose)
             # A single plane leaves sliding open, which the damping holds; a line or a point leaves a turn open.
-            determined = rotation_is_determined(object_side, weights) & rotation_is_determined(scene, weights)
+            sides = jnp.stack([object_side, scene])
+            determined = jax.vmap(rotation_is_determined, in_axes=(0, None))(sides, weights).all()
         else:
             pose, determined = fit_rigid(object_side, scene, weights), rotation_is_determined(object_side, weights)
         usable = determined & jnp.isfinite(pose).all() & (inside.sum(dtype=jnp.int32) >= _MIN_PAIRS)
@@ -255,7 +258,7 @@ def _icp(
         score=num_inliers.astype(jnp.float32) / num_scene,
         num_inliers=num_inliers,
         rms_error=unit * jnp.sqrt(mean_square),
-        inlier_mask=pairs.inside,
+        inlier_mask=in_order_given(pairs.inside),
         converged=status == PoseStatus.OK,
         status=status,
     )
