@@ -25,31 +25,17 @@ def map_rows(function: Callable[..., _Result], *items: Any) -> _Result:
 
 
 def map_real(function: Callable[..., _Result], real: Bool[Array, " s"], *items: Any) -> _Result:
-    """Map a function over leading axes, inside of jit, to zeros where `real` is false: on CPUs these are skipped."""
-    zeros = _zeros(function, *jax.tree.map(lambda leaf: leaf[0], items))
+    """Map a function over leading axes, inside of jit, to zeros where `real` is false: on CPUs these are skipped.
+
+    Accelerators call it anyway: their host would have to wait to know whether.
+    """
+    first = jax.tree.map(lambda leaf: leaf[0], items)
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, *first))
 
     def one(real: Bool[Array, ""], *item: Any) -> _Result:
         return jax.lax.cond(real, function, lambda *item: zeros, *item)
 
     return map_rows(one, real, *items)
-
-
-def only_if(real: Bool[Array, ""], function: Callable[..., _Result], *item: Any) -> _Result:
-    """Call a function inside of jit, or return zeros if not `real`: on CPUs it is skipped.
-
-    Accelerators call it anyway: their host would have to wait to know whether.
-    """
-    zeros = _zeros(function, *item)
-
-    def select(real: Bool[Array, ""], *item: Any) -> _Result:
-        return jax.tree.map(lambda found, zero: jnp.where(real, found, zero), function(*item), zeros)
-
-    return jax.lax.platform_dependent(
-        real,
-        *item,
-        cpu=lambda real, *item: jax.lax.cond(real, function, lambda *item: zeros, *item),
-        default=select,
-    )
 
 
 def call_rows(one: Callable[..., _Result], many: Callable[..., _Result], *items: Any) -> _Result:
@@ -69,7 +55,3 @@ def call_rows(one: Callable[..., _Result], many: Callable[..., _Result], *items:
         found = list(pool.map(lambda item: jax.device_get(one(*jax.device_put(item))), rows))
     stacked: _Result = jax.tree.map(lambda *leaves: np.stack(leaves), *found)
     return stacked
-
-
-def _zeros(function: Callable[..., _Result], *item: Any) -> _Result:
-    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, *item))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from kmn_jax.detection._device_part import DevicePart
-from kmn_jax.detection._mapping import map_real, only_if
+from kmn_jax.detection._mapping import map_real
 from kmn_jax.geometry import compose, inverse, squared_distances, transform_points
 from kmn_jax.pose import mssd
 from kmn_jax.programs import kept
@@ -85,7 +85,7 @@ def _greedy(
 
     def step(out: Bool[Array, " s"], row: Int[Array, ""]) -> tuple[Bool[Array, " s"], tuple[Array, Array]]:
         take = usable[row] & ~out[row]
-        others = only_if(take, lambda row: excluded_by(row) & (places != row), row)
+        others = map_real(lambda row: excluded_by(row) & (places != row), take[None], row[None])[0]
         return out | others, (take, others)
 
     order = jnp.argsort(-score, stable=True)

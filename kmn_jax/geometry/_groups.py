@@ -53,9 +53,9 @@ def nearest_within(
 ) -> tuple[Int[Array, "b q"], Float[Array, "b q"]]:
     """Return for each query the row of its nearest point and the distance, infinite where none is within reach.
 
-    What all distances say; of points that are equally near to rounding, the lowest row. On CPUs it is faster the closer together
-    the queries of a block are: best as `group_points` put them, wherever they moved as one since. Queries where `mask`
-    is false must be finite, and their result means nothing.
+    What all distances say; of points that are equally near to rounding, the lowest row. On CPUs it is faster the closer
+    together the queries of a block are: best as `group_points` put them, wherever they moved as one since. Queries
+    where `mask` is false must be finite, and their result means nothing.
     """
     rows, squares = jax.lax.platform_dependent(
         queries, mask, groups, jnp.asarray(reach, dtype=jnp.float32), cpu=_of_near_groups, default=_of_all

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from kmn_jax.detection import call_rows, map_real, map_rows
-from kmn_jax.detection._mapping import only_if
 from tests.reference.devices import accelerator_forms
 
 
@@ -38,19 +37,20 @@ def test_rows_are_mapped_in_their_order_and_skipped_where_not_real() -> None:
 
 
 def test_accelerators_are_given_no_choice_to_wait_for() -> None:
-    values, key = jnp.arange(3.0), jax.random.key(0)
-    found: dict[str, list[Pair]] = {
-        "here": [jax.jit(only_if, static_argnums=1)(real, one, values, key) for real in (True, False)]
-    }
+    values, key = jnp.arange(3.0)[None], jax.random.split(jax.random.key(0), 1)
+
+    def of_a_row(real: bool) -> Pair:
+        return jax.jit(map_real, static_argnums=0)(one, jnp.array([real]), values, key)
+
+    found = {"here": [of_a_row(True), of_a_row(False)]}
     with accelerator_forms():
-        program = jax.make_jaxpr(lambda real, *item: only_if(real, one, *item))(True, values, key)
-        assert "cond" not in str(program)
-        assert "select_n" in str(program)
-        found["there"] = [
-            jax.jit(lambda real, *item: only_if(real, one, *item))(real, values, key) for real in (True, False)
-        ]
+        program = str(jax.make_jaxpr(lambda real, *items: map_real(one, real, *items))(jnp.array([True]), values, key))
+        assert "cond" not in program
+        assert "select_n" in program
+        jax.clear_caches()
+        found["there"] = [of_a_row(True), of_a_row(False)]
     for called, zeros in found.values():
-        jax.tree.map(np.testing.assert_array_equal, called, one(values, key))
+        jax.tree.map(np.testing.assert_array_equal, called, jax.vmap(one)(values, key))
         jax.tree.map(lambda leaf: np.testing.assert_array_equal(leaf, 0), zeros)
 
 
