@@ -16,7 +16,7 @@ COMPILE := .venv-lock/bin/uv --no-config pip compile --quiet --generate-hashes -
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test check format bench bench-env compile-env newest attack docs lock platforms clean
+.PHONY: help demo test check format bench load bench-env compile-env newest attack docs lock platforms clean
 
 help: ## list these verbs
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' Makefile
@@ -40,8 +40,11 @@ format: $(READY) ## format and apply the safe lint fixes
 bench: $(READY) ## whether anything is slower than it was, by ratios
 	$(BIN)/python -m benchmarks.gate
 
-attack: $(READY) ## read 20,000 damaged files of every format: about 20 minutes
+attack: $(READY) ## read 20,000 damaged files of every format: a few minutes
 	$(BIN)/python -m tests.attack --json outputs/attack.json
+
+load: $(READY) ## send 1,000 scans from 8 clients to a server on this machine: about 20 minutes
+	$(BIN)/python -m benchmarks.serve --scans 1000 --clients 8
 
 bench-env: $(BENCH_READY) ## add PyTorch, for the benchmarks and the tests marked torch
 
