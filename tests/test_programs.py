@@ -77,6 +77,16 @@ def test_another_process_gets_the_same_without_tracing(folder: Path) -> None:
         jax.tree.map(np.testing.assert_array_equal, result, plain)
 
 
+def test_a_version_without_the_compilers_options_compiles_without_them(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = counted()[0](*given(), factor=2.0)
+    next_process(folder / "other")
+    monkeypatch.setattr(programs, "_QUICK", {"xla_cpu_of_another_version": True})
+    jax.tree.map(np.testing.assert_allclose, counted()[0](*given(), factor=2.0), plain)
+    assert files(folder / "other")
+
+
 def test_other_arguments_are_another_program(folder: Path) -> None:
     program, traces = counted()
     program(*given(), factor=2.0)

@@ -22,7 +22,15 @@ from kmn_jax.detection._mapping import call_rows
 from kmn_jax.detection._refinement import refine_many, refine_one
 from kmn_jax.detection._result import Detection, Detections
 from kmn_jax.detection._scene import Scene
-from kmn_jax.detection._search import Candidates, SearchConfig, crop_prediction, join, search_at, seed_keys
+from kmn_jax.detection._search import (
+    Candidates,
+    SearchConfig,
+    crop_prediction,
+    join,
+    no_poses,
+    search_at,
+    seed_keys,
+)
 from kmn_jax.detection._seeds import NUM_SEEDS, seeds_at, seeds_over
 from kmn_jax.detection._selection import Selection, select_poses
 from kmn_jax.detection._timing import Clock
@@ -92,7 +100,7 @@ def detect(
     on_device, warnings = device_part(model, part), scene.warnings
     propose = partial(search_at, model, on_device, scene, random_seed=random_seed, config=search)
     if at is None:
-        meanwhile(partial(refine_any, on_device, scene, search))
+        meanwhile(partial(refine_any, on_device, scene, search, model.config.num_keypoints))
         found, more = explore(scene, part, propose, probabilities.found, config, clock)
         warnings = (*warnings, *more)
     else:
@@ -153,8 +161,10 @@ def explore(
     return join(rounds), warnings
 
 
-def refine_any(on_device: DevicePart, scene: Scene, config: SearchConfig) -> None:
-    """Refine some pose, whose only use is that it compiles."""
+def refine_any(on_device: DevicePart, scene: Scene, config: SearchConfig, num_keypoints: int) -> None:
+    """Judge the poses of a crop that has none, and refine some pose, whose only use is that both are compiled."""
+    none = no_poses(config.crops, num_keypoints)
+    gather_evidence(none, on_device.arrays, on_device.surfels, scene.image, config.agreement)
     pose, row = jax.device_put((np.eye(4, dtype=np.float32), np.int32(0)))
     given = (on_device, scene.cloud, scene.image, config.crops.smooth, config.agreement)
     refine_one(pose, row, jax.random.key(0), *given)

@@ -27,6 +27,7 @@ from kmn_jax.detection._scene import Scene
 from kmn_jax.geometry import Crop, PaddedCloud
 from kmn_jax.models import Model
 from kmn_jax.objects import PartArrays
+from kmn_jax.pose import PoseResult
 from kmn_jax.typing import PRNGKey
 
 _KEYS = 128  # that are made at once
@@ -100,6 +101,29 @@ def _poses_around(
     crop_key, pose_key = jax.random.split(key)
     crop = crop_of_scene(cloud, row, part.diameter, crop_key, config)
     return find_poses_in_crop(graphdef, parameters, part, crop, pose_key, config)
+
+
+def no_poses(config: CropSearchConfig, num_keypoints: int) -> CropPoses:
+    """Return the poses of a crop that has none, in arrays like those of one that has some."""
+    poses, matches, points = config.num_poses, config.matches.capacity, config.points_of_draw
+
+    def zeros(*shape: int, dtype: Any = np.float32) -> Any:
+        return np.zeros(shape, dtype=dtype)
+
+    found = PoseResult(
+        T_scene_object=np.tile(np.eye(4, dtype=np.float32), (poses, 1, 1)),
+        score=zeros(poses),
+        num_inliers=zeros(poses, dtype=np.int32),
+        rms_error=zeros(poses),
+        inlier_mask=zeros(poses, matches, dtype=bool),
+        converged=zeros(poses, dtype=bool),
+        status=zeros(poses, dtype=np.int32),
+    )
+    draw = zeros(points, 3), zeros(points, 3), zeros(points, dtype=bool), zeros(points, 2), zeros(points, num_keypoints)
+    none: CropPoses = jax.device_put(
+        CropPoses(found, zeros(poses) - np.float32(np.inf), Prediction(*draw), zeros(3), zeros(dtype=bool))
+    )
+    return none
 
 
 def seed_keys(rows: Int[np.ndarray, " c"], random_seed: int) -> UInt32[np.ndarray, "c 2"]:

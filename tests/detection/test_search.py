@@ -12,14 +12,17 @@ import pytest
 from kmn_jax.detection import (
     EVIDENCE,
     Candidates,
+    CropPoses,
     CropSearchConfig,
     DevicePart,
     Scene,
     SearchConfig,
+    gather_evidence,
     make_scene,
     search_at,
     spread_seeds,
 )
+from kmn_jax.detection._search import no_poses
 from kmn_jax.geometry import PaddedCloud, spread_rows
 from kmn_jax.io import Scan
 from kmn_jax.models import Model, create_model, encode_object
@@ -122,6 +125,18 @@ def test_candidates_are_finite_and_those_of_their_seed(model: Model, part: Devic
     assert (np.abs(evidence["surface"]) <= 3).all()
     scores = np.where(np.isfinite(found.found.scores), found.found.scores, -9)
     assert (np.diff(scores, axis=1) <= 0).all(), "the best pose of a crop comes first"
+
+
+def test_no_poses_are_compiled_for_as_some_are(model: Model, part: DevicePart, scene: Scene) -> None:
+    def kinds(poses: CropPoses) -> list[tuple[tuple[int, ...], np.dtype]]:
+        return [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(poses)]
+
+    found = run(model, part, scene, [0]).found
+    none = no_poses(CROPS, NETWORK.num_keypoints)
+    assert kinds(none) == kinds(jax.tree.map(lambda leaf: leaf[0], found))
+    assert jax.tree.structure(none) == jax.tree.structure(found)
+    given = part.arrays, part.surfels, scene.image, CONFIG.agreement
+    np.testing.assert_array_equal(gather_evidence(none, *given), 0)
 
 
 def test_a_seed_among_nothing_gives_no_pose(model: Model, part: DevicePart) -> None:
