@@ -33,7 +33,8 @@ _MOST = 24  # programs of a folder that are kept
 _FOLDERS = 2  # of programs: of this version of the package, and of the one that was used before
 _DIGEST = 32  # bytes
 _PROCESS = 60.0  # seconds: what was used within so many was used by one process
-_QUICK = {"xla_cpu_use_fusion_emitters": False}  # compiles in half the time what is as fast, and rounds otherwise
+# Halves the time of compiling; programs are as fast, and round otherwise.
+_QUICK: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
 _store: _Store | None = None
 
 

@@ -111,7 +111,7 @@ def no_poses(config: CropSearchConfig, num_keypoints: int) -> CropPoses:
         return np.zeros(shape, dtype=dtype)
 
     found = PoseResult(
-        T_scene_object=np.tile(np.eye(4, dtype=np.float32), (poses, 1, 1)),
+        T_scene_object=zeros(poses, 4, 4) + np.eye(4, dtype=np.float32),
         score=zeros(poses),
         num_inliers=zeros(poses, dtype=np.int32),
         rms_error=zeros(poses),
