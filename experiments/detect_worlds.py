@@ -99,7 +99,7 @@ class WorldTally:
 
 def run(options: Options) -> dict[str, Any]:
     """Detect, print and return the numbers."""
-    for target in (options.json, options.picture):
+    for target in (options.json, options.picture, options.worst and options.worst / "worst.png"):
         check_target(target)
     model = load_pretrained() if options.model is None else load_model(options.model)
     fitted = load_probabilities(options.calibration, EVIDENCE)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+MOST_BEHIND = 0.01  # share of a scan's points: with more behind a camera, it was not there
+
 
 def placed(T: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s 3"]:
     """Return points of a pose's source frame in its target frame."""

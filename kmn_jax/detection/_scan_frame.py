@@ -8,13 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from kmn_jax.detection._frames import into
+from kmn_jax.detection._frames import MOST_BEHIND, into
 from kmn_jax.detection._result import Detections
 from kmn_jax.errors import InputError
 from kmn_jax.io import Scan, pose_matrix
 from kmn_jax.typing import ArrayInput
 
-_MOST_BEHIND = 0.01  # share of the points: with more behind it, the camera was not there
 _OPENGL = (
     "all points lie at negative z, as in frames of OpenGL (y up, z backwards)",
     "negate y and z of all points, or give T_scene_camera = diag(1, -1, -1, 1) in Python",
@@ -45,7 +44,7 @@ def scan_frame(scan: Scan, sensor: Float[np.ndarray, "3"] | None, T_scene_camera
         raise InputError("a depth image is in the frame of its camera: leave T_scene_camera out")
     pose = pose_matrix(T_scene_camera, "T_scene_camera")
     behind = float((into(pose, scan.points)[:, 2] <= 0).mean())
-    if behind > _MOST_BEHIND:
+    if behind > MOST_BEHIND:
         raise InputError(
             f"{behind:.0%} of the points lie behind the camera of T_scene_camera: give the camera's pose in the frame"
             " of the points, z forward (its inverse, or axes of OpenGL, look like this)"

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from kmn_jax.detection._depth_agreement import DepthImage, depth_buffer
 from kmn_jax.detection._foreground import ForegroundOptions, foreground
-from kmn_jax.detection._frames import into, placed
+from kmn_jax.detection._frames import MOST_BEHIND, into, placed
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import Camera, PaddedCloud, intrinsics, pad_cloud
 from kmn_jax.io import FAR, Scan
@@ -24,7 +24,6 @@ _SIDE = 1024  # pixels along both sides of an image that is made of a cloud: one
 _SAMPLE = 2000  # points whose spacing is measured
 _NEAREST = 1e-3  # of the distance of the cloud: a sensor nearer than that to a point lies in the cloud
 _FARTHEST = 1e4  # diameters of an object, from the sensor: beyond, float32 does not hold its surface
-_MOST_BEHIND = 0.01  # share of the points: with more behind it, the sensor was not there
 
 
 @dataclass(frozen=True)
@@ -143,7 +142,7 @@ def _seen(scan: Scan, sensor: Float[np.ndarray, "3"] | None) -> _Seen:
     typical = float(np.median(distances))
     rotation = _towards(offsets.mean(axis=0), typical)
     points = offsets @ rotation.T
-    if distances.min() <= _NEAREST * typical or (points[:, 2] <= 0).mean() > _MOST_BEHIND:
+    if distances.min() <= _NEAREST * typical or (points[:, 2] <= 0).mean() > MOST_BEHIND:
         where = "the origin" if sensor is None else f"{tuple(float(x) for x in place)}"
         raise InputError(f"the sensor cannot have been at {where}, among the points: say where it was")
     rows = np.flatnonzero(points[:, 2] > 0)
