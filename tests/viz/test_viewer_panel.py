@@ -19,8 +19,9 @@ import kmn_jax.cli
 from kmn_jax.detection import Detections, OrientedBox, Scene
 from kmn_jax.errors import InputError, number_list
 from kmn_jax.viz import PartMesh, Viewer, distinct_colors, one_after_the_other, part_mesh
+from kmn_jax.viz._legend import warnings_once
 from kmn_jax.viz._viewer_poses import rank_of_same
-from kmn_jax.viz._viewer_text import heading, warnings_once
+from kmn_jax.viz._viewer_text import heading
 from kmn_jax.web import listen
 from tests.detection.box_sample import SIZES
 from tests.reference.meshes import box, pose, random_rotations
