@@ -126,6 +126,7 @@ def read_targets(folder: Path) -> list[tuple[FrameKey, int, str]]:
 
     Raises InputError if the folder holds no world bins.
     """
+    require_made(folder)
     try:
         targets = json.loads((folder / TARGETS).read_text(encoding="utf-8"))
         names = json.loads((folder / NAMES).read_text(encoding="utf-8"))

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from experiments.evaluation.predictions import Export
 from experiments.evaluation.scores import THRESHOLD, cells_of
 from experiments.evaluation.sources import bop_objects
+from experiments.made_data import require_made
 from kmn_jax.errors import InputError
 from kmn_jax.report import print_table, write_json
 
@@ -40,6 +41,7 @@ class Options:
 
 def compare(options: Options) -> list[dict[str, Any]]:
     """Return a row for each method and noise. Raises InputError if the crops of both are not the same."""
+    require_made(options.dataset)
     models = {found.name: found.model for found in bop_objects(options.dataset, options.split, print)}
     titles = {name: name for name in options.methods}
     folders = [_opened(folder) for folder in (options.before, options.after)]

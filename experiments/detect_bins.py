@@ -25,6 +25,7 @@ from tqdm import tqdm
 from experiments.bins import LEAST_VISIBLE, THRESHOLD, BinImage, TrueImage, bin_images
 from experiments.calibrate import SHIPPED
 from experiments.fpfh import fpfh_poses
+from experiments.made_data import require_made
 from experiments.reliability_picture import reliability_table, save_reliability
 from experiments.test_sets import SPLIT
 from kmn_jax.detection import (
@@ -49,6 +50,7 @@ from kmn_jax.pose import LEFT_OUT, RIGHT, THRESHOLDS, WRONG, average_precision, 
 from kmn_jax.report import check_target, print_table, write_json
 
 CONFIG = DetectConfig()
+FPFH_CALIBRATION = Path("outputs/fpfh.calibration.json")
 METHODS = ("kmn_jax", "kmn_jax, thorough", "FPFH")
 PRECISION = 0.95  # at which recalls are compared
 _NOWHERE = (np.nan, np.nan, np.nan)
@@ -63,7 +65,7 @@ class Options:
     every: int = 1  # use every so many images
     methods: tuple[str, ...] = METHODS
     calibration: Path = SHIPPED
-    fpfh_calibration: Path = Path("outputs/fpfh.calibration.json")  # python -m experiments.calibrate --method FPFH
+    fpfh_calibration: Path = FPFH_CALIBRATION
     json: Path | None = None
     picture: Path | None = None  # .png file for the reliability diagram
 
@@ -143,21 +145,18 @@ class Tally:
             "precision": float(right[chosen].mean()) if chosen.any() else None,
             "calibration error": expected_calibration_error(probability, right),
             "median s": float(np.median(self.seconds)),
-            **self._accuracy(probability, chosen & right),
+            **self._accuracy(probability, chosen, right),
         }
 
-    def _accuracy(self, probability: np.ndarray, right: np.ndarray) -> dict[str, Any]:
+    def _accuracy(self, probability: np.ndarray, chosen: np.ndarray, right: np.ndarray) -> dict[str, Any]:
         """Return how exact accepted poses are that are right, and BOP's measures of all poses."""
-        offsets, states = (
-            np.array(self.offsets).reshape(-1, 3)[right],
-            np.array(self.states).reshape(-1, len(THRESHOLDS)),
-        )
+        offsets = np.array(self.offsets).reshape(-1, 3)[chosen & right]
+        states = np.array(self.states).reshape(-1, len(THRESHOLDS))
         row: dict[str, Any] = {}
         for column, name in enumerate(("turned, degrees", "shifted, mm", "shifted, diameters")):
             for share, text in ((50, "median"), (90, "90%")):
                 values = offsets[:, column]
                 row[f"{name}, {text}"] = float(np.percentile(values, share)) if len(values) else None
-        chosen = probability >= CONFIG.accepted
         hits = (states[chosen][:, THRESHOLDS.index(THRESHOLD)] == RIGHT).sum()
         row["MSSD recall"] = float(hits) / max(self.copies, 1)
         each = [
@@ -175,6 +174,12 @@ def run(options: Options) -> dict[str, Any]:
     unknown = [name for name in options.methods if name not in METHODS]
     if unknown:
         raise InputError(f"method {unknown[0]!r} is not known: choose among {', '.join(METHODS)}")
+    if "FPFH" in options.methods and options.fpfh_calibration == FPFH_CALIBRATION and not FPFH_CALIBRATION.exists():
+        raise InputError(
+            f"{FPFH_CALIBRATION} has not been made yet: python -m experiments.calibrate --method FPFH --output"
+            f" {FPFH_CALIBRATION}, or leave FPFH out by --methods kmn_jax"
+        )
+    require_made(*options.sets)
     model = load_pretrained() if options.model is None else load_model(options.model)
     fitted: dict[str, Probabilities] = {
         name: load_probabilities(options.fpfh_calibration if name == "FPFH" else options.calibration, EVIDENCE)

@@ -1,7 +1,8 @@
 """Make a run's best weights the released ones: `python -m experiments.release RUN EVALUATION`.
 
 Writes to `kmn_jax/pretrained/`: the weights, the learning curve as CSV and as a picture, and a model card with all that
-is known of the run. Give the JSON of `experiments.evaluate_network` of the same weights for the card's tables.
+is known of the run. Give the JSON of `experiments.evaluate_network` of the same weights for the card's tables, and by
+`--detection` what `experiments.detect_bins` and `experiments.detect_worlds` wrote, for how exact poses are.
 """
 
 from __future__ import annotations
@@ -27,6 +28,14 @@ from kmn_jax.train import read_metrics
 FOLDER = Path(__file__).parent.parent / "kmn_jax" / "pretrained"
 LIMIT = 10_000_000  # bytes of a released file
 _COLUMNS = ("step", "samples", "seconds", "split", "loss", "segmentation_accuracy", "keypoint_accuracy")
+_ALL = "all"  # what detect_worlds calls the row of all families
+_POSES = (
+    "Of accepted poses that are right by ADI: by how much they are off, the median and, after the stroke, the 90th "
+    "percentile, with the object's symmetries taken out; the shift is that of its centre. ADI forgives a part that is "
+    "nearly round any turn about its axis, and a nearly square one a quarter. MSSD, the largest distance of a point, "
+    "does not: its recall is by accepted poses, at a tenth of the diameter. BOP's average precision is of all poses, "
+    "over thresholds of MSSD from 0.05 to 0.5 diameters. Copies are those of which at least 30% is visible."
+)
 _PUBLISHED_SAMPLES = 27_840_000  # arXiv 2303.16102: 120 epochs of 232,000
 
 
@@ -38,6 +47,7 @@ class Options:
     evaluation: tyro.conf.Positional[Path]  # what `python -m experiments.evaluate_network RUN --json` wrote
     name: str | None = None  # of the released model; the run's unless given
     folder: Path = FOLDER
+    detection: tuple[Path, ...] = ()  # what detect_bins and detect_worlds wrote by --json, of the same weights
 
 
 def release(options: Options) -> list[Path]:
@@ -48,6 +58,7 @@ def release(options: Options) -> list[Path]:
     config = _json(options.run / "config.json", ("name", "network", "pack", "optimizer", "pipeline"))
     evaluation = _json(options.evaluation, ("sha256", "splits", "published", "objects"))
     sessions = _sessions(options.run / "sessions.jsonl")
+    poses = poses_section([_json(path, ("environment", "detection")) for path in options.detection])
     weights = source.read_bytes()
     digest = hashlib.sha256(weights).hexdigest()
     if evaluation.get("sha256") != digest:
@@ -67,7 +78,7 @@ def release(options: Options) -> list[Path]:
     write_whole(paths[".csv"], _curve(rows).encode())
     _picture(rows, paths[".png"])
     size = sum(int(leaf.size) for leaf in jax.tree.leaves(model.parameters))
-    card = _card(name, config, sessions, validated, evaluation, size, digest)
+    card = _card(name, config, sessions, validated, evaluation, size, digest, poses)
     write_whole(paths[".md"], card.encode())
     return list(paths.values())
 
@@ -130,6 +141,7 @@ def _card(
     evaluation: dict[str, Any],
     parameters: int,
     digest: str,
+    poses: str,
 ) -> str:
     best = min(validated, key=lambda row: float(row["loss"]))
     last, network = validated[-1], config["network"]
@@ -165,6 +177,7 @@ def _card(
     parts.append(markdown_table([*evaluation["splits"], *evaluation["published"]]))
     for folder, rows in evaluation["objects"].items():
         parts.append(f"## Test objects: {folder}\n\n{markdown_table(rows) if rows else 'None.'}")
+    parts += filter(None, [poses])
     parts.append(
         "## What it leaves on the table\n\n"
         f"Keypoint accuracy on validation objects went from {validated[0]['keypoint_accuracy']:.3f} after"
@@ -172,6 +185,44 @@ def _card(
         " curve for whether it still rises. The published accuracy took many more samples."
     )
     return "\n\n".join(parts) + "\n"
+
+
+def poses_section(detections: list[dict[str, Any]]) -> str:
+    """Return how many copies of whole bins are found and how exactly, of what detection wrote; empty without any."""
+    rows = [row for found in detections for row in _whole(found["detection"])]
+    if not rows:
+        return ""
+    table = [
+        {
+            "bins": "world bins" if row["bins"] == _ALL else row["bins"],
+            "copies": row["copies"],
+            "recall": f"{row['recall']:.2f}",
+            "right, of the accepted": _share(row["precision"]),
+            "shifted, mm": _both(row, "shifted, mm"),
+            "shifted, % of the diameter": _both(row, "shifted, diameters", 100),
+            "turned, degrees": _both(row, "turned, degrees"),
+            "MSSD recall": f"{row['MSSD recall']:.2f}",
+            "average precision": _share(row["average precision"]),
+        }
+        for row in rows
+    ]
+    commands = dict.fromkeys(f"`{found['environment']['command']}`" for found in detections)
+    return f"## Poses in whole bins\n\n{_POSES}\n\n{markdown_table(table)}\n\nBy {' and '.join(commands)}."
+
+
+def _whole(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows that are neither of one object nor of one family."""
+    return [row for row in rows if row["bins"] == _ALL] or [row for row in rows if ":" not in row["bins"]]
+
+
+def _both(row: dict[str, Any], name: str, times: float = 1) -> str:
+    """Return the median and the 90th percentile as text."""
+    values = [row[f"{name}, {which}"] for which in ("median", "90%")]
+    return "-" if None in values else " / ".join(f"{times * value:.3g}" for value in values)
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
 
 
 def _processor(session: dict[str, Any]) -> str:

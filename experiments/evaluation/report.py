@@ -114,12 +114,18 @@ def headline(cells: Sequence[Cell], own: str, rivals: Collection[str]) -> str:
     if own not in recalls:
         return ""
     count = len({cell.object for cell in cells})
-    text = f"{own} finds the right pose in {recalls[own]:.0%} of the crops of {count} object{'s' if count > 1 else ''}"
+    text = f"{own} finds the right pose in {_percent(recalls[own])} of the crops of {count} object"
+    text += "s" if count > 1 else ""
     others = {method: recalls[method] for method in recalls if method in rivals}
     if others:
         best = max(others, key=lambda method: others[method])
-        text += f", the best rival, {best}, in {others[best]:.0%}"
+        text += f", the best rival, {best}, in {_percent(others[best])}"
     return f"{text} ({noise_name(noise)})."
+
+
+def _percent(share: float) -> str:
+    """Return a share as the tables round it."""
+    return f"{float(f'{share:.2f}'):.0%}"
 
 
 def _rivals(result: Result) -> list[str]:
@@ -218,17 +224,18 @@ def _page(
 ) -> str:
     body = [f"<h1>Evaluation: {html.escape(result.config.name)}</h1>"]
     body.append(f'<p class="headline">{html.escape(_headline(result))}</p>')
-    drawn = {
-        name: f'<img alt="{name}" src="data:image/png;base64,{base64.b64encode(content).decode()}">'
-        for name, content in pictures.items()
-    }
+    sources = {name: base64.b64encode(content).decode() for name, content in pictures.items()}
+    drawn = [
+        f'<div class="wide"><img alt="{name}" src="data:image/png;base64,{source}"></div>'
+        for name, source in sources.items()
+    ]
     for number, (title, text, rows) in enumerate(sections):
         if title == _SETTINGS:
             body += [f"<details><summary>{html.escape(title)}</summary>", _table(rows), "</details>"]
         else:
             body += [f"<h2>{html.escape(title)}</h2>", _paragraphs(text), _table(rows)]
         if number == 0:  # what tells most comes first
-            body += drawn.values()
+            body += drawn
     facts = [f"<dt>{html.escape(key)}</dt><dd>{html.escape(value)}</dd>" for key, value in _facts(result).items()]
     body += [f"<details><summary>{_ORIGIN}</summary><dl>", *facts, "</dl></details>"]
     return _PAGE.replace("{title}", html.escape(result.config.name)).replace("{body}", "\n".join(body))
@@ -258,7 +265,9 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> str:
 def _text(value: Any) -> str:
     if value is None:
         return "-"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
+    return str(value)
 
 
 def _scores(result: Result) -> dict[str, Any]:
@@ -312,9 +321,10 @@ dl { display: grid; grid-template-columns: max-content 1fr; gap: .1rem 1rem; fon
 dt { color: #666; } dd { margin: 0; overflow-wrap: anywhere; }
 .wide { overflow-x: auto; } table { border-collapse: collapse; font-size: .85rem; }
 th, td { border-bottom: 1px solid #ddd; padding: .25rem .6rem; text-align: left; vertical-align: top; }
-th { border-bottom: 2px solid #888; overflow-wrap: anywhere; } th:not(:first-child) { min-width: 4rem; }
+th { border-bottom: 2px solid #888; overflow-wrap: break-word; } th:not(:first-child) { min-width: 4rem; }
 td:first-child { white-space: nowrap; }
 img { max-width: 100%; }
+@media (max-width: 800px) { img[alt=cases] { max-width: none; width: 1100px; } }
 </style>
 </head>
 <body>

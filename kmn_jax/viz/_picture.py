@@ -34,12 +34,15 @@ from kmn_jax.viz._shading import (
 )
 from kmn_jax.viz._truth import TRUTH_COLORS, truth_codes
 
-_CANVAS_SIDE = 800  # pixels of a panel
-_PANEL = 6.4  # inches of its longer side
+_CANVAS_SIDE = 960  # pixels of the panel of poses
+_PANEL = 9.6  # inches of its longer side
+_SMALL = 1 / 3  # of it are the others, which stand beside it
+_SIDE, _HEIGHT = 3.6, 8.4  # inches that the list of poses needs
 _WHOLE, _CLOSEST = 0.8, 0.05  # of the scan's width: what fills more is not zoomed in on, and nothing closer than
 _MOST_CROP_POINTS = 200_000
 _IN_FRONT = 0.05  # of the diameter: what was measured that much nearer hides a pose
 _DOTS = 20_000  # of the foreground that no pose explains
+_TITLE = 10  # points, of the small panels
 _DASH = 7  # pixels of the outlines of unlikely poses
 
 
@@ -56,7 +59,7 @@ def save_picture(
     found: Detections,
     truth: Sequence[Float[np.ndarray, "4 4"]] | None = None,
 ) -> None:
-    """Write a PNG with four panels: the scan, the segmentation, the keypoints, and the poses.
+    """Write a PNG of the poses, beside which stand, smaller, the scan, the segmentation and the keypoints.
 
     With `truth`, the true poses `T_scene_object` of all copies, the segmentation is coded as by `truth_codes`. A result
     without poses makes a picture that says why. Raises InputError if the path is no PNG file's or cannot be written
@@ -72,21 +75,23 @@ def save_picture(
     panels = _Panels(view, part, found)
     aspect = float(np.clip(panels.canvas.width / panels.canvas.height, 0.6, 2.0))
     width, height = _PANEL * min(1.0, aspect), _PANEL * min(1.0, 1 / aspect)
-    figure = Figure(figsize=(2 * width + 3.8, 2 * height + 1.2), dpi=100, layout="constrained")
+    beside = max(_SMALL * width, 0.9 * _SIDE)
+    size = width + beside + _SIDE + 0.6, max(height, _HEIGHT) + 1.2
+    figure = Figure(figsize=size, dpi=100, layout="constrained")
     figure.get_layout_engine().set(wspace=0.02, hspace=0.03)
     figure.suptitle(f"{part.name}: {summary(found)}", fontsize=15, parse_math=False)
-    grid = figure.add_gridspec(2, 3, width_ratios=(width, width, 3.4))
-    panels.draw_scan(figure.add_subplot(grid[0, 0]))
+    grid = figure.add_gridspec(3, 3, width_ratios=(width, beside, _SIDE))
+    panels.draw_poses(figure.add_subplot(grid[:, 0]))
+    panels.draw_scan(figure.add_subplot(grid[0, 1]))
     if truth is None:
-        panels.draw_segmentation(figure.add_subplot(grid[0, 1]))
+        panels.draw_segmentation(figure.add_subplot(grid[1, 1]))
     else:
-        panels.draw_truth(figure.add_subplot(grid[0, 1]), truth)
-    panels.draw_keypoints(figure.add_subplot(grid[1, 0]))
-    panels.draw_poses(figure.add_subplot(grid[1, 1]))
-    side = grid[:, 2].subgridspec(3, 1, height_ratios=(1, 1, 2.4))
-    draw_part(figure.add_subplot(side[0]), part, (0.5, 0.6, -0.62), "The object's keypoints")
-    draw_part(figure.add_subplot(side[1]), part, (-0.5, -0.6, 0.62), "from behind")
-    draw_list(figure.add_subplot(side[2]), found)
+        panels.draw_truth(figure.add_subplot(grid[1, 1]), truth)
+    panels.draw_keypoints(figure.add_subplot(grid[2, 1]))
+    side = grid[:, 2].subgridspec(2, 2, height_ratios=(1, 3.2))
+    draw_part(figure.add_subplot(side[0, 0]), part, (0.5, 0.6, -0.62), "The object's keypoints")
+    draw_part(figure.add_subplot(side[0, 1]), part, (-0.5, -0.6, 0.62), "from behind")
+    draw_list(figure.add_subplot(side[1, :]), found)
     content = io.BytesIO()
     figure.savefig(content, format="png")
     write_whole(path, content.getvalue())
@@ -132,15 +137,15 @@ class _Panels:
         left, right, bottom, top = self.canvas.extent
         if right - left < 0.97 * (self.box[1] - self.box[0]):
             axis.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False, color="black", ls="--"))
-            title += "; the other panels show what is framed"
-        axis.set_title(title)
+            title += "; framed: what others show"
+        axis.set_title(title, fontsize=_TITLE)
 
     def draw_segmentation(self, axis: Any) -> None:
         self._draw_scan(axis, self.grey)
         colors = np.where(self.on_object[:, None], self.pose_colors[self.crop_of], NOT_THE_PART)
         self._draw_points(axis, colors, self.on_object)
         share = self.on_object.sum() / max(1, len(self.on_object))
-        axis.set_title(f"Segmentation: {share:.0%} of the crops' points are on a copy (coloured)")
+        axis.set_title(f"Segmentation: {share:.0%} of points on a copy (coloured)", fontsize=_TITLE)
 
     def draw_truth(self, axis: Any, truth: Sequence[Float[np.ndarray, "4 4"]]) -> None:
         from matplotlib.patches import Patch
@@ -156,13 +161,13 @@ class _Panels:
             for (name, color), share in zip(TRUTH_COLORS.items(), shares, strict=True)
         ]
         axis.figure.legend(handles=patches, loc="outside lower center", ncols=5, fontsize=10, frameon=False)
-        axis.set_title("Points of the crops against the truth")
+        axis.set_title("Points of the crops against the truth", fontsize=_TITLE)
 
     def draw_keypoints(self, axis: Any) -> None:
         self._draw_scan(axis, self.grey)
         colors = distinct_colors(self.part.num_keypoints)[self.keypoint]
         self._draw_points(axis, colors, np.where(self.on_object, 0, -1))
-        axis.set_title("Likeliest keypoint of points on a copy")
+        axis.set_title("Likeliest keypoint of points on a copy", fontsize=_TITLE)
 
     def draw_poses(self, axis: Any) -> None:
         import matplotlib.patheffects as effects
@@ -239,15 +244,14 @@ class _Panels:
     ) -> None:
         """Draw the crops' points; where they overlap those of the highest rank, and of a negative one none."""
         if not self.found.poses:
-            self._tell_why_not(axis)
             return
         rows = np.random.default_rng(0).permutation(len(rank))[:_MOST_CROP_POINTS]
         rows = rows[(rank[rows] >= 0) & (self.points[rows, 2] > 0)]
         rows = rows[np.lexsort([-self.points[rows, 2], rank[rows]])]
         places = image_places(self.view.camera, self.points)
         # So large that they nearly cover what they stand for.
-        pixels = np.clip(1.6 * self.canvas.scale * spacing(places[self.crop_of == 0]), 3, 12)
-        points = pixels / _CANVAS_SIDE * _PANEL * 72
+        pixels = np.clip(1.6 * self.canvas.scale * spacing(places[self.crop_of == 0]), 4, 14)
+        points = pixels / _CANVAS_SIDE * _SMALL * _PANEL * 72
         axis.scatter(*places[rows].T, s=points**2, c=colors[rows], marker="s", lw=0)
 
     def _draw_scan(self, axis: Any, colors: Float[np.ndarray, "h w c"], background: float = 0.98) -> None:
@@ -262,9 +266,10 @@ class _Panels:
     def _tell_why_not(self, axis: Any) -> None:
         text = textwrap.fill(self.found.reason or "no pose was found", 40)
         box = {"facecolor": "white", "edgecolor": "0.4", "boxstyle": "round,pad=0.6"}
-        axis.text(
+        told = axis.text(
             0.5, 0.5, text, ha="center", va="center", transform=axis.transAxes, fontsize=12, bbox=box, parse_math=False
         )
+        told.set_in_layout(False)
 
 
 def _measured_box(view: Scene) -> tuple[float, float, float, float]:

@@ -32,6 +32,7 @@ _LAYERS = {  # what can be switched: whether it is shown at first, and what it i
     "Depth colours": (False, "colour the scan by depth: yellow is near"),
     "Surfaces": (True, "the object at its poses"),
     "Labels": (True, "rank and probability"),
+    "Grasps": (True, "the first free grasp of each pose: fingers, and where they come from"),
     "Axes": (False, "the object's frames: x red, y green, z blue"),
     "Segmentation": (False, "points around the seeds: in the pose's colour if taken for the object, else dark"),
     "Keypoints": (False, "points taken for the object, in the colours of their likeliest keypoints"),
@@ -167,6 +168,7 @@ class Viewer:
         self.found = found
         self._list = PoseList(self._server, self._scene, self._part, found, float(self._least.value), self._on_pose)
         self._back.visible = found is not self._first
+        self._layers["Grasps"].visible = any(pose.grasps for pose in found.poses)
         if found is self._first:
             self._scene.mark.visible = False
         self._header.content = self._heading()

@@ -9,10 +9,10 @@ import numpy as np
 
 from kmn_jax.detection import Detection, Detections, placed
 from kmn_jax.objects import Part
-from kmn_jax.viz._legend import LIKELY
+from kmn_jax.viz._legend import LIKELY, warnings_once
 from kmn_jax.viz._shading import distinct_colors
 from kmn_jax.viz._viewer_scene import PageScene, PoseNodes
-from kmn_jax.viz._viewer_text import details, facts, warnings_once
+from kmn_jax.viz._viewer_text import details, facts
 
 _NONE = "none"
 _SAME = 0.02  # of the diameter: poses whose points differ by less on average are one

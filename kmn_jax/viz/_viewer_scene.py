@@ -39,6 +39,8 @@ _REACH = np.radians(1.5)  # from a click, in which the nearest point of the scan
 _SAME_RAY = np.radians(0.3)  # points so near to the clicked ray hide each other
 # Of the diameter: so much nearer to the sensor are surfaces and points of crops drawn, to be seen before the scan.
 _SURFACE_LIFT, _CROP_LIFT = 0.006, 0.012
+_FINGERS = 0.35  # of the diameter, their length where a grasp is drawn, which knows its width only
+_GRASP = (1.0, 0.0, 0.9)
 _PALE = 0.6  # share of white in the colours of unlikely poses
 
 
@@ -99,7 +101,7 @@ class PageScene:
         self._scan.colors = self._by_depth if by_depth else self._grey
 
     def add_pose(self, rank: int, pose: Detection, color: Float[np.ndarray, "3"], count: int) -> PoseNodes:
-        """Add one of `count` poses; its layers are Surfaces, Labels, Segmentation and Keypoints."""
+        """Add one of `count` poses: Surfaces, Labels, Segmentation, Keypoints and, if a grasp is free, Grasps."""
         from viser.transforms import SO3
 
         scene, part, name = self._scene, self._part, f"/poses/{rank}"
@@ -139,15 +141,23 @@ class PageScene:
         points = into(T, seen) / self.size
         colors = np.where(on[:, None], color, NOT_THE_PART)
         keypoints = distinct_colors(part.num_keypoints)[prediction.keypoint[on]]
-        return PoseNodes(
-            frame,
-            {
-                "Surfaces": surface,
-                "Labels": label,
-                "Segmentation": self._add_points(f"{name}/segmentation", points, as_bytes(colors)),
-                "Keypoints": self._add_points(f"{name}/keypoints", points[on], as_bytes(keypoints)),
-            },
-        )
+        layers = {
+            "Surfaces": surface,
+            "Labels": label,
+            "Segmentation": self._add_points(f"{name}/segmentation", points, as_bytes(colors)),
+            "Keypoints": self._add_points(f"{name}/keypoints", points[on], as_bytes(keypoints)),
+        }
+        if pose.grasps:
+            first = pose.grasps[0]
+            ends = placed(self._T_view_scene @ first.T_scene_grasp, _fork(first.width, _FINGERS * part.diameter))
+            layers["Grasps"] = scene.add_line_segments(
+                f"{name}/grasp",
+                (into(T, ends) / self.size).astype(np.float32),
+                as_bytes(np.array(_GRASP)),
+                thickness=4.0,
+                thickness_units="screen",
+            )
+        return PoseNodes(frame, layers)
 
     def picked(
         self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
@@ -219,6 +229,13 @@ def _hexagon_mesh(part: Part, most: int) -> PartMesh:
     _, corners = surface_hexagons(part, most)
     fan = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
     return PartMesh(corners.reshape(-1, 3), (6 * np.arange(len(corners))[:, None, None] + fan).reshape(-1, 3))
+
+
+def _fork(width: float, length: float) -> Float[np.ndarray, "4 2 3"]:
+    """Return lines of a gripper in its frame: two fingers, tips beside the origin, and where it comes from."""
+    left, right = np.array([-width / 2, 0, 0]), np.array([width / 2, 0, 0])
+    back = np.array([0, 0, -length])
+    return np.array([[left, left + back], [right, right + back], [left + back, right + back], [back, 2 * back]])
 
 
 def nearest_to_ray(

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from kmn_jax.detection import Detection, Detections
 from kmn_jax.units import place_text
-from kmn_jax.viz._legend import summary
+from kmn_jax.viz._legend import summary, warnings_once
 from kmn_jax.viz._shading import as_bytes
 
 _LEAST_COMPILING = 0.05  # seconds that are told
@@ -20,28 +20,6 @@ _COPY = (
     "const box = this.previousElementSibling; box.select();"
     " this.textContent = document.execCommand('copy') ? 'Copied' : 'Press Ctrl+C'"
 )
-
-
-def warnings_once(found: Detections) -> tuple[list[str], list[list[str]]]:
-    """Return the warnings of the whole, each once, and those that only one pose has, by pose.
-
-    What several poses are warned of is one line of the first list.
-    """
-    common = list(dict.fromkeys(found.warnings))
-    ranks: dict[str, list[int]] = {}
-    for rank, pose in enumerate(found.poses, start=1):
-        for text in dict.fromkeys(pose.warnings):
-            ranks.setdefault(text, []).append(rank)
-    common += [
-        f"poses {', '.join(map(str, those))}: {text}"
-        for text, those in ranks.items()
-        if len(those) > 1 and text not in found.warnings
-    ]
-    own = [
-        [text for text in dict.fromkeys(pose.warnings) if len(ranks[text]) == 1 and text not in found.warnings]
-        for pose in found.poses
-    ]
-    return common, own
 
 
 def heading(found: Detections, scan: str | None, num_points: int, doing: str = "") -> str:

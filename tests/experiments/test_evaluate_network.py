@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -94,6 +95,20 @@ def test_the_released_model_does_what_its_card_says(tmp_path: Path) -> None:
 def test_a_model_that_was_never_released_is_refused() -> None:
     with pytest.raises(InputError, match=r"there is no released model 'huge': there are small"):
         load_pretrained("huge")
+
+
+def test_the_card_tells_how_exact_poses_are(run: Path, evaluation: Path, tmp_path: Path) -> None:
+    results = [str(ASSETS.parent / "results" / f"{name}.json") for name in ("detection", "worlds_test")]
+    assert release.main([str(run), str(evaluation), "--folder", str(tmp_path), "--detection", *results]) == 0
+    (section,) = re.findall(r"^## Poses in whole bins\n.*?(?=^## )", (tmp_path / "tiny.md").read_text(), re.M | re.S)
+    assert section in evaluate_network.SHIPPED.with_suffix(".md").read_text()  # the released one's, of these results
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in section.splitlines() if line.startswith("| ")]
+    assert [row[0] for row in rows] == ["bins", "electronics", "industrial", "world bins"]
+    assert rows[0][4:] == [
+        *("shifted, mm", "shifted, % of the diameter", "turned, degrees"),
+        *("MSSD recall", "average precision"),
+    ]
+    assert rows[1][4:] == ["0.221 / 1.51", "0.9 / 3.56", "1.78 / 180", "0.51", "0.42"]
 
 
 def test_a_release_holds_weights_curve_picture_and_card(run: Path, evaluation: Path, tmp_path: Path) -> None:

@@ -10,11 +10,21 @@ from pathlib import Path
 
 import pytest
 
-from experiments import build_data, evaluate, evaluate_network, train, tune_rivals
+from experiments import (
+    build_data,
+    compare_runs,
+    detect_bins,
+    detect_worlds,
+    evaluate,
+    evaluate_network,
+    train,
+    tune_rivals,
+)
 from experiments.made_data import _MAKERS, require_made
 from kmn_jax.errors import InputError
 
 ROOT = Path(__file__).parents[2]
+TEST_SET = Path("outputs/test_sets/electronics")
 
 
 @pytest.mark.parametrize(
@@ -40,6 +50,23 @@ def test_the_command_that_makes_the_data_is_named(
     assert said.endswith(f"has not been made yet: python -m experiments.build_data {maker}\n")
     assert said.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("command", "maker"),
+    [
+        (lambda: detect_bins.run(detect_bins.Options()), "calibrate --method FPFH --output outputs/fpfh.calibration"),
+        (lambda: detect_bins.run(detect_bins.Options(methods=("kmn_jax",))), "build_data test-sets"),
+        (lambda: detect_worlds.run(detect_worlds.Options()), "build_data worlds"),
+        (lambda: compare_runs.compare(compare_runs.Options(Path("a"), Path("b"), TEST_SET)), "build_data test-sets"),
+    ],
+)
+def test_so_is_it_by_measurements_of_whole_bins_and_comparisons(
+    command: Callable[[], object], maker: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=rf"has not been made yet: python -m experiments\.{maker}"):
+        command()
 
 
 def test_a_benchmark_without_data_is_one_sentence() -> None:

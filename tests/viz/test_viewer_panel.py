@@ -16,11 +16,13 @@ import pytest
 import trimesh
 
 import kmn_jax.cli
-from kmn_jax.detection import Detections, OrientedBox, Scene
+from kmn_jax.detection import Detections, OrientedBox, Pick, Scene
 from kmn_jax.errors import InputError, number_list
 from kmn_jax.viz import PartMesh, Viewer, distinct_colors, one_after_the_other, part_mesh
+from kmn_jax.viz._legend import warnings_once
 from kmn_jax.viz._viewer_poses import rank_of_same
-from kmn_jax.viz._viewer_text import heading, warnings_once
+from kmn_jax.viz._viewer_scene import _GRASP
+from kmn_jax.viz._viewer_text import heading
 from kmn_jax.web import listen
 from tests.detection.box_sample import SIZES
 from tests.reference.meshes import box, pose, random_rotations
@@ -77,6 +79,26 @@ def test_the_slider_hides_what_is_less_probable(browser: Any, sample: tuple[Scen
         assert "probability 0.93" in text(browser)
         page.show(replace(found, poses=found.poses[::-1]))
         assert (page.is_shown(1), page.is_shown(2)) == (False, True)  # the filter stays
+
+
+def test_the_first_free_grasp_is_drawn(browser: Any, sample: tuple[Scene, Detections]) -> None:
+    view, found = sample
+    first, second = found.poses
+    T_object_grasp = pose((0, 0, -SIZES[2]))  # in front of the box
+    picks = tuple(Pick(name, SIZES[0], first.T_scene_object @ T_object_grasp) for name in ("one", "other"))
+    held = replace(found, poses=(replace(first, grasps=picks), replace(second, grasps=())))
+    with Viewer(view, PART, held, port=0, mesh=MESH) as page:
+        look_at(browser, page)
+        assert page.is_shown(1, "Grasps")
+        eventually(lambda: count_like(browser, np.array(_GRASP)) > 100)
+        shown = count_like(browser, np.array(_GRASP))
+        click(browser, "Grasps")
+        eventually(lambda: not page.is_shown(1, "Grasps"))
+        eventually(lambda: count_like(browser, np.array(_GRASP)) < shown - 100)
+        page._list.choose(1)
+        eventually(lambda: "free grasps" in text(browser))
+        page.show(found)
+        eventually(lambda: "Grasps" not in text(browser).split())
 
 
 def test_the_region_writes_its_flag(browser: Any, sample: tuple[Scene, Detections]) -> None:
