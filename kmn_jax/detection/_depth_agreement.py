@@ -103,6 +103,16 @@ def depth_at(image: DepthImage, x: Float[Array, "*s"], y: Float[Array, "*s"]) ->
     return _value(image.depth, row, column)
 
 
+def measured_at(image: DepthImage, points: Float[Array, "m 3"]) -> Float[Array, "m 3"]:
+    """Return the points that were measured in the pixels that points fall into; infinitely far where nothing was."""
+    row, column, _ = _pixels(points, points[:, 2] > 0, image.camera)
+    z = _value(image.depth, row, column)
+    camera = image.camera
+    x, y = (column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
+    there = (z > 0) & (points[:, 2] > 0)
+    return jnp.where(there[:, None], jnp.stack([x * z, y * z, z], axis=1), jnp.inf)
+
+
 def _window(
     depth: Float[Array, "h w"], row: Int[Array, " m"], column: Int[Array, " m"], reach: int
 ) -> Float[Array, "m k"]:

@@ -19,6 +19,7 @@ from kmn_jax.detection._device_part import DevicePart, device_part, same_place
 from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
 from kmn_jax.detection._frames import placed
 from kmn_jax.detection._mapping import call_rows
+from kmn_jax.detection._polish import polish_many, polish_one
 from kmn_jax.detection._refinement import refine_many, refine_one
 from kmn_jax.detection._result import Detection, Detections
 from kmn_jax.detection._scene import Scene
@@ -118,6 +119,8 @@ def detect(
                 found = refined_candidates(on_device, scene, found, rows, random_seed, search)
             with clock("selection"):
                 choice = chosen(found, calibration, on_device, config)
+            with clock("refinement"):
+                found = polished_candidates(on_device, scene, found, np.flatnonzero(choice.kept))
     with clock("report"):
         poses = detections(found, choice, calibration, part, scene)
         accepted = choice.kept & (calibration.probability(found.evidence) >= config.accepted)
@@ -215,6 +218,21 @@ def refined_candidates(
         found.found,
         found.seed_rows,
     )
+
+
+def polished_candidates(
+    on_device: DevicePart, scene: Scene, found: Candidates, rows: Int[np.ndarray, " k"]
+) -> Candidates:
+    """Return the candidates with some of their poses polished: their evidence is that of before."""
+    if not len(rows):
+        return found
+    poses = found.T_camera_object.copy()
+    poses[rows] = call_rows(
+        lambda pose: polish_one(pose, on_device, scene.image),
+        lambda poses: polish_many(poses, on_device, scene.image),
+        poses[rows],
+    )
+    return found._replace(T_camera_object=poses)
 
 
 def _forms_first(leaf: Any) -> np.ndarray:

@@ -14,8 +14,8 @@ from kmn_jax.pose._accuracy import (
     match_copies,
     symmetric_pose_error,
 )
-from kmn_jax.pose._icp import IcpConfig, icp
-from kmn_jax.pose._kabsch import kabsch
+from kmn_jax.pose._icp import IcpConfig, icp, plane_step
+from kmn_jax.pose._kabsch import kabsch, rotation_is_determined
 from kmn_jax.pose._matches import MatchConfig, Matches, find_matches
 from kmn_jax.pose._metrics import (
     add,
@@ -55,9 +55,11 @@ __all__ = [
     "kabsch",
     "match_copies",
     "mssd",
+    "plane_step",
     "ransac",
     "ransac_modes",
     "recall",
+    "rotation_is_determined",
     "surface_agreement",
     "symmetric_pose_error",
 ]

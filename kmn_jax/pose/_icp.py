@@ -203,7 +203,7 @@ def _icp(
         residual = residuals(moved)
         weights = jnp.where(inside, _robust_weight(residual / gate, config.robust), 0)
         if config.method == "point_to_plane":
-            update = _plane_step(moved, normals, residual, weights)
+            update = plane_step(moved, normals, residual, weights)
             pose = compose(update, state.pose)
             # A single plane leaves sliding open, which the damping holds; a line or a point leaves a turn open.
             sides = jnp.stack([object_side, scene])
@@ -273,7 +273,7 @@ def _robust_weight(residual: Float[Array, " n"], kind: str) -> Float[Array, " n"
     return jnp.ones_like(residual)
 
 
-def _plane_step(moved: Points, normals: Normals, residual: Float[Array, " n"], weights: Float[Array, " n"]) -> Pose:
+def plane_step(moved: Points, normals: Normals, residual: Float[Array, " n"], weights: Float[Array, " n"]) -> Pose:
     """Return the small motion that brings points onto their planes, by the damped 6x6 normal equations."""
     rows = jnp.concatenate([jnp.cross(moved, normals), normals, residual[:, None]], axis=1)
     # The residual is one column more: all sums are one product.
