@@ -4,7 +4,8 @@ python -m benchmarks.compiled --target h200 [--only "network, 64"] [--texts FOLD
 
 Needs the environment of `make compile-env`: run it by .venv-compile/bin/python. Nothing is run, so every time is
 computed: a floor from the vendor's ceilings, and what is expected from the guesses in `compiled_targets.py`, both with
-kernels one after the other. Loops whose length only the data knows are taken to make `trips` trips.
+kernels one after the other. Loops whose length only the data knows are taken to make `trips` trips. Of TPUs, whose
+programs the host starts once, a launch is a kernel within the program, and no machine code is made.
 
 With `--measure` the programs are compiled for the device that is there, counted the same, and also timed, on drawn
 numbers: what was expected beside what is.
@@ -17,6 +18,7 @@ import json as json_module
 import re
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from benchmarks.compiled_counts import Counts, Kernel, count
 from benchmarks.compiled_hlo import parse_module
 from benchmarks.compiled_programs import Program, programs
 from benchmarks.compiled_targets import TARGETS, Target, devices_of, prepare, seconds, seconds_of
+from benchmarks.compiled_tpu import optimized
 from benchmarks.timing import time_in_turn
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import ask_for_fast_selection
@@ -71,7 +74,12 @@ def main(
     rows: list[dict[str, Any]] = []
     details: dict[str, Any] = {}
     for program in chosen:
-        text, facts = _compiled(program, devices, None if texts is None or measure else texts / target, measure)
+        if measure:
+            text, facts = _compiled(program, devices, True)
+        else:
+            on_tpu = where.platform == "tpu"
+            make = partial(optimized, target, program.name) if on_tpu else partial(_compiled, program, devices)
+            text, facts = _kept(program, make, texts and texts / target)
         counts = count(parse_module(text), trips)
         rows.append(_row(program, counts, facts, where))
         details[program.name] = _details(counts, where) | facts
@@ -81,14 +89,27 @@ def main(
     print_table(f"programs compiled for {target}", rows)
 
 
-def _compiled(program: Program, devices: list[Any], folder: Path | None, measure: bool) -> tuple[str, dict[str, Any]]:
-    """Return the text of a compiled program, its memory and perhaps its time; from a folder if they are there."""
+def _kept(
+    program: Program, make: Callable[[], tuple[str, dict[str, Any]]], folder: Path | None
+) -> tuple[str, dict[str, Any]]:
+    """Return the text of a compiled program and what is known of it; from a folder if they are there."""
+    if folder is None:
+        return make()
     name = re.sub(r"\W+", "-", program.name)
-    kept = None if folder is None else folder / f"{name}.hlo.gz"
-    if kept is not None and kept.exists():
+    kept = folder / f"{name}.hlo.gz"
+    if kept.exists():
         with gzip.open(kept, "rt") as file:
             first, text = file.read().split("\n", 1)
         return text, json_module.loads(first)
+    text, facts = make()
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    with gzip.open(kept, "wt") as file:
+        file.write(json_module.dumps(facts) + "\n" + text)
+    return text, facts
+
+
+def _compiled(program: Program, devices: list[Any], measure: bool = False) -> tuple[str, dict[str, Any]]:
+    """Return the text of a compiled program, its memory and perhaps its time."""
     start = time.perf_counter()
     function, arguments = program.make(devices)
     lowered = function.lower(*arguments)
@@ -103,12 +124,7 @@ def _compiled(program: Program, devices: list[Any], folder: Path | None, measure
     }
     if measure:
         facts |= _measured(compiled, arguments, program.goes_on)
-    text = compiled.as_text()
-    if kept is not None:
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        with gzip.open(kept, "wt") as file:
-            file.write(json_module.dumps(facts) + "\n" + text)
-    return text, facts
+    return compiled.as_text(), facts
 
 
 def _measured(compiled: Callable[..., Any], arguments: tuple[Any, ...], goes_on: bool) -> dict[str, float]:

@@ -7,6 +7,7 @@ place, what is written. Operations are those of products and of arithmetic on ea
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -28,6 +29,8 @@ _NO_ARITHMETIC = _FREE | {
 }  # fmt: skip
 _SOME_ROWS = ("dynamic-slice", "gather", "slice")
 _COLLECTIVES = ("all-gather", "all-reduce", "all-to-all", "collective-permute", "reduce-scatter")
+# Of TPUs: names for memory, and for how indices are kept.
+_FREE_CALLS = {"AllocateBuffer", "AssumeGatherIndicesInBound", "ConcatBitcast", "GatherScatterIndicesBitpacked"}
 _HOST_SPACE = 5
 _HOST_CALLS = ("callback", "MoveToHost", "MoveToDevice", "host_")
 _WAITS_FOR_LENGTH = "loop of unknown length"
@@ -118,16 +121,19 @@ def _walk(module: Module, computation: Computation, times: int, assumed: int, co
     for one in computation:
         if one.opcode in _FREE or one.opcode.endswith(("-done", "-update")):
             continue
+        if one.opcode == "custom-call" and one.attribute("custom_call_target") in _FREE_CALLS:
+            continue
         if one.opcode == "while":
-            trips = one.trips if one.trips is not None else assumed
-            if one.trips is None:
+            known = one.trips if one.trips is not None else _counted_trips(module, computation, one)
+            trips = known if known is not None else assumed
+            if known is None:
                 counts.waits[_WAITS_FOR_LENGTH] += times * (trips + 1)
             before = counts.launches
-            for role in ("body",) if one.trips is not None else ("condition", "body"):
+            for role in ("body",) if known is not None else ("condition", "body"):
                 runs = times * trips
                 _walk(module, module.computations[one.called[role]], runs, assumed, counts)
             kernels = (counts.launches - before) // max(times * trips, 1)
-            counts.loops.append(Loop(origin_of(one), times, trips, one.trips is not None, kernels))
+            counts.loops.append(Loop(origin_of(one), times, trips, known is not None, kernels))
         elif one.opcode == "conditional":
             counts.waits[_WAITS_FOR_BRANCH] += times
             names = one.branches or tuple(one.called[role] for role in ("true_computation", "false_computation"))
@@ -147,6 +153,35 @@ def count_of(module: Module, name: str, times: int, assumed: int) -> Counts:
     counts = Counts([], [], Counter(), Counter())
     _walk(module, module.computations[name], times, assumed, counts)
     return counts
+
+
+def _counted_trips(module: Module, computation: Computation, one: Instruction) -> int | None:
+    """Return how often a loop runs that counts from 0 by 1 up to a constant; texts for TPUs do not say it."""
+    condition, body = (module.computations[one.called[role]] for role in ("condition", "body"))
+    test, start, end = condition.root, computation.instructions.get(one.operands[0]), body.root
+    if test.opcode != "compare" or test.attribute("direction") != "LT" or start is None:
+        return None
+    counter = _uncopied(condition, test.operands[0])
+    place = None if counter is None else counter.attribute("index")
+    if place is None or not start.opcode == end.opcode == "tuple":
+        return None
+    step = body.instructions[end.operands[int(place)]]
+    before = _uncopied(body, step.operands[0]) if step.opcode == "add" else None
+    by_one = before is not None and before.attribute("index") == place and _constant(body, step.operands[1]) == 1
+    from_zero = _constant(computation, start.operands[int(place)]) == 0
+    return _constant(condition, test.operands[1]) if by_one and from_zero else None
+
+
+def _constant(computation: Computation, name: str) -> int | None:
+    one = _uncopied(computation, name)
+    return int(one.operands[0]) if one is not None and one.opcode == "constant" and one.operands[0].isdigit() else None
+
+
+def _uncopied(computation: Computation, name: str) -> Instruction | None:
+    one = computation.instructions.get(name)
+    while one is not None and one.opcode in ("bitcast", "copy"):
+        one = computation.instructions.get(one.operands[0])
+    return one
 
 
 def _add(counts: Counts, more: Counts) -> None:
@@ -266,6 +301,8 @@ def _written(one: Instruction, inside: Computation | None) -> int:
         return 2 * inside.instructions[root.operands[1]].bytes
     if one.opcode == "custom-call":  # of a tuple's parts, the last is often working memory
         return one.shapes[0].bytes if len(one.shapes) < 3 and "cublas" in one.attributes else _main_bytes(one)
+    if one.opcode == "copy-start":  # what it writes, what it reads, and a number of its own
+        return one.shapes[0].bytes if one.shapes[0].space == 0 else 0
     if one.opcode.endswith("-start"):
         return one.shapes[-1].bytes
     return _main_bytes(one)
@@ -283,7 +320,7 @@ def _operations(where: Computation, one: Instruction) -> tuple[Unit, float]:
             depth = prod(left.extents[place] for place in contracted)
         else:
             labels = (one.attribute("dim_labels") or "").split("_")[1].split("->")[0]
-            depth = right.extents[labels.index("i")]
+            depth = right.extents[labels.index("i")] * _summed_window(one.attribute("window") or "")
         exact = "highest" in one.attributes
         return _unit(left.kind, exact), 2.0 * one.shapes[0].elements * depth
     target = one.attribute("custom_call_target") or ""
@@ -300,6 +337,18 @@ def _operations(where: Computation, one: Instruction) -> tuple[Unit, float]:
         sources = [where.instructions[name] for name in one.operands[: len(one.operands) // 2]]
         return "plain", float(sum(source.elements for source in sources))
     return "plain", float(one.elements)
+
+
+def _summed_window(window: str) -> int:
+    """Return over how many places of a window there are numbers: TPUs see products as convolutions.
+
+    Where a side of it is padded or its operand is spread out, each result has one number: an axis of a batch.
+    """
+    found = dict(re.findall(r"(\w+)=(\S+)", window))
+    sizes = [int(size) for size in found["size"].split("x")] if "size" in found else []
+    pads = found["pad"].split("x") if "pad" in found else ["0_0"] * len(sizes)
+    spread = found["lhs_dilate"].split("x") if "lhs_dilate" in found else ["1"] * len(sizes)
+    return prod(size for size, pad, by in zip(sizes, pads, spread, strict=True) if (pad, by) == ("0_0", "1"))
 
 
 def _unit(kind: str, exact: bool) -> Unit:

@@ -15,6 +15,7 @@ from kmn_jax.errors import InputError
 _BITS = {"pred": 8, "s4": 4, "u4": 4, "s2": 2, "u2": 2, "token": 0, "opaque": 0}
 _SHAPE = re.compile(r"([a-z]\w*)\[([\d,]*)\](?:\{([^}]*)\})?")
 _SPACE = re.compile(r"S\((\d+)\)")
+_TILE = re.compile(r":T\(([\d,]+)\)")
 _COMPUTATION = re.compile(r"^(ENTRY )?%?([\w.$\-]+) \(.*\) -> .*\{$")
 _INSTRUCTION = re.compile(r"^\s+(ROOT )?%?([\w.$\-]+) = (.*)$")
 _CALLS = re.compile(r"\b(calls|to_apply|body|condition|true_computation|false_computation)=%?([\w.$\-]+)")
@@ -25,11 +26,15 @@ _COMMENT = re.compile(r"/\*.*?\*/")
 
 @dataclass(frozen=True)
 class Shape:
-    """An array: its type, its extents, and the memory that it lies in, 0 being the device's main one."""
+    """An array: its type, its extents, and the memory that it lies in, 0 being the device's main one.
+
+    On TPUs it lies there in tiles, and its last axes in memory are filled up to whole ones.
+    """
 
     kind: str
     extents: tuple[int, ...]
     space: int = 0
+    stored: int = 0  # numbers with what fills up tiles, 0 if that is none
 
     @property
     def elements(self) -> int:
@@ -38,10 +43,10 @@ class Shape:
 
     @property
     def bytes(self) -> int:
-        """How many bytes they take."""
+        """How many bytes they take, those that fill up tiles included."""
         found = re.search(r"\d+", self.kind)
         bits = _BITS.get(self.kind, int(found[0]) if found else 0)
-        return -(-self.elements * bits // 8)
+        return -(-max(self.elements, self.stored) * bits // 8)
 
 
 @dataclass(frozen=True)
@@ -154,7 +159,7 @@ def _instruction(name: str, text: str, is_root: bool) -> Instruction:
         opcode,
         tuple(_shapes(shapes)),
         # Before version 0.9 or so, and in some programs, each operand's shape stands before its name.
-        tuple(re.findall(r"%([\w.$\-]+)", inside)) or ((inside,) if opcode == "parameter" else ()),
+        tuple(re.findall(r"%([\w.$\-]+)", inside)) or ((inside,) if opcode in ("constant", "parameter") else ()),
         attributes,
         is_root,
         dict(_CALLS.findall(attributes)),
@@ -164,8 +169,20 @@ def _instruction(name: str, text: str, is_root: bool) -> Instruction:
 
 def _shapes(text: str) -> Iterator[Shape]:
     for kind, extents, layout in _SHAPE.findall(text):
-        space = _SPACE.search(layout)
-        yield Shape(kind, tuple(int(n) for n in extents.split(",") if n), int(space[1]) if space else 0)
+        space, whole = _SPACE.search(layout), tuple(int(n) for n in extents.split(",") if n)
+        yield Shape(kind, whole, int(space[1]) if space else 0, _stored(whole, layout))
+
+
+def _stored(extents: tuple[int, ...], layout: str) -> int:
+    """Return how many numbers an array in tiles takes: a layout names its axes, the last in memory first."""
+    tile = _TILE.search(layout)
+    if tile is None or 0 in extents:
+        return 0
+    filled = [extents[int(axis)] for axis in layout[: tile.start()].split(",") if axis] or [1]
+    sides = [int(side) for side in tile[1].split(",")]
+    for place, side in enumerate(reversed(sides[-len(filled) :])):
+        filled[place] = -(-filled[place] // side) * side
+    return prod(filled)
 
 
 def _closing(text: str, start: int) -> int:

@@ -119,7 +119,8 @@ def prepare(target: Target) -> None:
         flags = [f"--{name}={value}" for name, value in _CUDA_FLAGS.items() if name not in given]
         os.environ["XLA_FLAGS"] = " ".join([given, *flags]).strip()
     else:
-        os.environ["TPU_SKIP_MDS_QUERY"] = "1"
+        # No chip is held, so that more than one process may have the compiler.
+        os.environ |= {"TPU_SKIP_MDS_QUERY": "1", "ALLOW_MULTIPLE_LIBTPU_LOAD": "1"}
 
 
 def devices_of(target: Target) -> list[Any]:

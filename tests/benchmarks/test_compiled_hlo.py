@@ -11,6 +11,7 @@ import pytest
 from benchmarks.compiled_counts import Counts, count
 from benchmarks.compiled_hlo import parse_module
 from benchmarks.compiled_targets import TARGETS, seconds
+from benchmarks.compiled_tpu import megabytes, optimized
 from kmn_jax.errors import InputError
 
 _FUSIONS = """HloModule jit_f, is_scheduled=true
@@ -118,6 +119,47 @@ ENTRY %main (a: f32[2048,64], b: f32[64,128], c: bf16[16,32]) -> f32[2048,128] {
     '"rhs_contracting_dimensions":["0"]},"precision_config":{"operand_precision":["HIGHEST","HIGHEST"]}}}',
 )
 
+_TPU = """HloModule jit_k
+
+%once_more (s: (s32[], f32[256])) -> (s32[], f32[256]) {
+  %s = (s32[]{:T(128)}, f32[256]{0:T(256)}) parameter(0)
+  %one = s32[]{:T(128)} constant(1)
+  %i = s32[]{:T(128)} get-tuple-element(%s), index=0
+  %x = f32[256]{0:T(256)} get-tuple-element(%s), index=1
+  %i.2 = s32[]{:T(128)} copy(%i)
+  %next = s32[]{:T(128)} add(%i.2, %one)
+  %negative = f32[256]{0:T(256)} negate(%x)
+  ROOT %t = (s32[]{:T(128)}, f32[256]{0:T(256)}) tuple(%next, %negative)
+}
+
+%fewer (s.1: (s32[], f32[256])) -> pred[] {
+  %s.1 = (s32[]{:T(128)}, f32[256]{0:T(256)}) parameter(0)
+  %all = s32[]{:T(128)} constant(17)
+  %i.1 = s32[]{:T(128)} get-tuple-element(%s.1), index=0
+  ROOT %less = pred[]{:T(512)} compare(%i.1, %all), direction=LT
+}
+
+ENTRY %main (a: bf16[4,100,30], b: bf16[4,30,64], c: f32[256], d: f32[4,20,30], e: s32[]) -> f32[256] {
+  %a = bf16[4,100,30]{2,1,0:T(8,128)(2,1)} parameter(0)
+  %b = bf16[4,30,64]{2,1,0:T(8,128)(2,1)} parameter(1)
+  %c = f32[256]{0:T(256)} parameter(2)
+  %d = f32[4,20,30]{1,2,0:T(8,128)} parameter(3)
+  %e = s32[]{:T(128)} parameter(4)
+  %zero = s32[]{:T(128)} constant(0)
+  %copied = s32[]{:T(128)} copy(%zero)
+  %buffer = f32[4096]{0:T(1024)} custom-call(), custom_call_target="AllocateBuffer"
+  %near = (f32[4,20,30]{1,2,0:T(8,128)S(1)}, f32[4,20,30]{1,2,0:T(8,128)}, u32[]{:S(2)}) copy-start(%d)
+  %nearer = f32[4,20,30]{1,2,0:T(8,128)S(1)} copy-done(%near)
+  %each = bf16[4,100,64]{2,1,0:T(8,128)(2,1)S(1)} convolution(%a, %b), WINDOW, dim_labels=0bf_0io->0bf
+  %both = bf16[100,64]{1,0:T(8,128)(2,1)S(1)} convolution(%a, %b), window={size=4}, dim_labels=0bf_0io->0bf
+  %state = (s32[]{:T(128)}, f32[256]{0:T(256)}) tuple(%copied, %c)
+  %loop = (s32[]{:T(128)}, f32[256]{0:T(256)}) while(%state), condition=%fewer, body=%once_more
+  %later = (s32[]{:T(128)}, f32[256]{0:T(256)}) tuple(%e, %c)
+  %other = (s32[]{:T(128)}, f32[256]{0:T(256)}) while(%later), condition=%fewer, body=%once_more
+  ROOT %x.1 = f32[256]{0:T(256)} get-tuple-element(%loop), index=1
+}
+""".replace("WINDOW", "window={size=4 stride=3 lhs_dilate=4}")
+
 
 def counted(text: str, trips: int = 3) -> Counts:
     return count(parse_module(text), trips)
@@ -170,6 +212,37 @@ def test_library_calls_collectives_and_transfers_to_the_host_are_told_apart() ->
     assert product.bytes == 4 * (2048 * 64 + 64 * 128 + 2048 * 128)  # but not its working memory
     selection = next(kernel for kernel in counts.kernels if "TopK" in kernel.kind)
     assert (selection.sorted_elements, selection.sort_stages) == (2048 * 64, 0)
+
+
+def test_texts_for_tpus_have_tiles_loops_that_do_not_say_their_length_and_products_as_convolutions() -> None:
+    counts = counted(_TPU, trips=3)
+    # The second loop starts from a number that only the data knows.
+    assert [(loop.trips, loop.known) for loop in counts.loops] == [(17, True), (3, False)]
+    assert counts.kinds["negate"] == 17 + 3
+    each, both = (kernel for kernel in counts.kernels if kernel.kind == "convolution")
+    assert each.operations == {"bfloat16": 2 * 4 * 100 * 64 * 30}  # one product for each of four
+    assert both.operations == {"bfloat16": 2 * 100 * 64 * 30 * 4}  # and their sum
+    assert each.bytes == 2 * 4 * (104 * 128 + 32 * 128)  # tiles filled up; the result is not in the main memory
+    start = next(kernel for kernel in counts.kernels if kernel.kind == "copy" and kernel.origin == "near")
+    assert start.bytes == 4 * 4 * 32 * 128  # the axis of 20 lies along lanes; read, and not written back
+    assert not any(kind.startswith("library") for kind in counts.kinds)
+
+
+def test_memory_is_summed_from_the_list_of_a_tpu_s_allocations() -> None:
+    memory = """BufferAssignment:
+allocation 0: size 2000000, parameter 3, shape |f32[500000]| at ShapeIndex {}:
+ value: <138 reduce_and.2 @0> (size=512,offset=0): pred[]{:T(512)}
+allocation 1: size 1000000, parameter 4, shape |f32[250000]| at ShapeIndex {}:
+allocation 2: size 512, thread-local:
+allocation 3: size 3000000, preallocated-temp:
+allocation 4: size 4000000, color 1, preallocated-temp:
+"""
+    assert megabytes(memory) == {"temporary MB": 3.0, "argument MB": 3.0}
+
+
+def test_a_program_that_is_not_compiled_for_a_tpu_is_an_error() -> None:
+    with pytest.raises(InputError, match="no such program"):
+        optimized("v5e-1", "no such program")
 
 
 def test_times_are_the_longest_of_what_a_kernel_does() -> None:
