@@ -103,14 +103,14 @@ def depth_at(image: DepthImage, x: Float[Array, "*s"], y: Float[Array, "*s"]) ->
     return _value(image.depth, row, column)
 
 
-def measured_at(image: DepthImage, points: Float[Array, "m 3"]) -> Float[Array, "m 3"]:
-    """Return the points that were measured in the pixels that points fall into; infinitely far where nothing was."""
+def measured_at(image: DepthImage, points: Float[Array, "m 3"]) -> tuple[Float[Array, "m 3"], Bool[Array, " m"]]:
+    """Return what was measured in the pixels that points fall into, and whether anything was: else the points."""
     row, column, _ = _pixels(points, points[:, 2] > 0, image.camera)
-    z = _value(image.depth, row, column)
-    camera = image.camera
-    x, y = (column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
+    camera, z = image.camera, _value(image.depth, row, column)
+    x = (column.astype(jnp.float32) - camera.cx) / camera.fx
+    y = (row.astype(jnp.float32) - camera.cy) / camera.fy
     there = (z > 0) & (points[:, 2] > 0)
-    return jnp.where(there[:, None], jnp.stack([x * z, y * z, z], axis=1), jnp.inf)
+    return jnp.where(there[:, None], jnp.stack([x * z, y * z, z], axis=1), points), there
 
 
 def _window(

@@ -165,12 +165,13 @@ def explore(
 
 
 def refine_any(on_device: DevicePart, scene: Scene, config: SearchConfig, num_keypoints: int) -> None:
-    """Judge the poses of a crop that has none, and refine some pose, whose only use is that both are compiled."""
+    """Judge the poses of a crop that has none, refine some pose and polish it, whose only use is that all is compiled."""
     none = no_poses(config.crops, num_keypoints)
     gather_evidence(none, on_device.arrays, on_device.surfels, scene.image, config.agreement)
     pose, row = jax.device_put((np.eye(4, dtype=np.float32), np.int32(0)))
     given = (on_device, scene.cloud, scene.image, config.crops.smooth, config.agreement)
     refine_one(pose, row, jax.random.key(0), *given)
+    polish_one(pose, on_device, scene.image)
 
 
 def refined_candidates(

@@ -21,10 +21,10 @@ from kmn_jax.simulate import SplatConfig, visible_by_splatting
 from kmn_jax.typing import Pose, Scalar
 
 _SIGHT = SplatConfig(resolution=64)  # of the part alone
-_ROUNDS = 12
+_ROUNDS = 15
 _GATE = 0.05  # diameters, between a point of the part and what was measured in its direction
 _SPREADS = 4  # medians of the distances, beyond which a measurement is of something else
-_LEAST_SPREAD = 5e-4  # diameters
+_LEAST_SPREAD = 2.5e-3  # diameters
 _MOST_TURN, _MOST_SHIFT = 0.35, 0.05  # radians and diameters: more is another pose
 _LEAST_POINTS = 32
 
@@ -48,9 +48,9 @@ def polished(pose: Pose, part: DevicePart, image: DepthImage) -> Pose:
 
     def fit(pose: Pose) -> _Fit:
         moved, normals = transform_points(pose, points), rotate_vectors(pose, surfels.normals)
-        measured = (measured_at(image, moved * diameter + centre[None]) - centre[None]) / diameter
-        apart = moved - measured
-        near = seen & ((apart**2).sum(axis=1) <= _GATE**2)
+        measured, there = measured_at(image, moved * diameter + centre[None])
+        apart = moved - (measured - centre[None]) / diameter
+        near = seen & there & ((apart**2).sum(axis=1) <= _GATE**2)
         return _Fit(moved, normals, (normals * apart).sum(axis=1), near)
 
     def reach(fit: _Fit) -> Scalar:

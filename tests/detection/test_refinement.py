@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from experiments.solids import box, union
 from kmn_jax.detection import DepthAgreementConfig, DevicePart, Scene, make_scene, symmetry_transforms
 from kmn_jax.detection._look_alikes import MOST, look_alikes
+from kmn_jax.detection._polish import polished
 from kmn_jax.detection._refinement import refined_forms
 from kmn_jax.geometry import Camera, SmoothConfig, crop_around, measured_points
 from kmn_jax.io import Scan
@@ -25,6 +26,7 @@ pytestmark = pytest.mark.usefixtures("few_optimisations")
 
 CAMERA = Camera(500.0, 500.0, 159.5, 119.5, 320, 240)
 TRUE = pose((0.05, -0.02, 3.0), random_rotations(1, 5)[0])
+POLISHED = jax.jit(polished)
 FORMS = jax.jit(refined_forms, static_argnames=("smooth", "agreement", "margin"))
 
 
@@ -109,15 +111,17 @@ def test_a_symmetry_is_no_look_alike() -> None:
     assert not (halves & is_real & (np.abs(turns[:, :3, 3]).max(axis=1) < 0.05 * part.diameter)).any()
 
 
+def device_of(part: Part, is_rival: np.ndarray) -> DevicePart:
+    turns, _ = turns_of(part)
+    surfels = Surfels(jnp.asarray(part.points), jnp.asarray(part.normals), jnp.float32(part.area))
+    arrays = PartArrays(surfels.points, surfels.normals, jnp.zeros((8, 4)), jnp.float32(part.diameter))
+    return DevicePart(arrays, surfels, jnp.eye(4)[None], jnp.float32(0), jnp.asarray(turns), jnp.asarray(is_rival))
+
+
 def forms_of(part: Part, scene: Scene, starts: np.ndarray, is_rival: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the refined forms of each start, and which of them there are."""
-    turns, _ = turns_of(part)
-    seed = jnp.int32(len(scene.points) // 2)
-    surfels = Surfels(jnp.asarray(part.points), jnp.asarray(part.normals), jnp.float32(part.area))
-    diameter = jnp.float32(part.diameter)
-    arrays = PartArrays(surfels.points, surfels.normals, jnp.zeros((8, 4)), diameter)
-    on_device = DevicePart(arrays, surfels, jnp.eye(4)[None], jnp.float32(0), jnp.asarray(turns), jnp.asarray(is_rival))
-    crop = crop_around(jax.random.key(0), scene.cloud, seed, diameter, 2048, 1)
+    seed, on_device = jnp.int32(len(scene.points) // 2), device_of(part, is_rival)
+    crop = crop_around(jax.random.key(0), scene.cloud, seed, on_device.arrays.diameter, 2048, 1)
     settings = {"smooth": SmoothConfig(), "agreement": DepthAgreementConfig(), "margin": 2.0}
     results = [FORMS(jnp.asarray(start), crop, on_device, scene.image, **settings) for start in starts]
     found, there = (np.stack(leaves) for leaves in zip(*results, strict=True))
@@ -147,3 +151,54 @@ def test_a_pipe_is_not_drawn_to_its_bore() -> None:
     starts[:, 2, 3] += [-0.02, 0.02, 0.04]
     found, _ = forms_of(pipe, view_of(mesh, lying), starts, np.zeros(MOST, dtype=bool))
     assert np.abs(found[:, 0, 2, 3] - lying[2, 3]).max() < wall / 6
+
+
+def moved(T: np.ndarray, seed: int, degrees: float, shift: float) -> np.ndarray:
+    """Return a pose turned about the part's centre, and shifted."""
+    axis, way = np.random.default_rng(seed).normal(size=(2, 3))
+    step = np.eye(4)
+    step[:3, :3] = rotation_about(axis / np.linalg.norm(axis), np.radians(degrees))
+    step[:3, 3] = shift * way / np.linalg.norm(way)
+    return (T @ step).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("noise", "hidden", "bound"), [(0.0, False, 0.001), (0.005, False, 0.004), (0.0, True, 0.015), (0.005, True, 0.015)]
+)
+def test_polished_poses_are_those_of_the_image(
+    part: Part, scene: Scene, noise: float, hidden: bool, bound: float
+) -> None:
+    on_device, diameter = device_of(part, np.zeros(MOST, dtype=bool)), part.diameter
+    rng = np.random.default_rng(0)
+    depth = np.asarray(scene.image.depth)
+    depth = np.where(depth > 0, depth + noise * diameter * rng.normal(size=depth.shape), 0).astype(np.float32)
+    if hidden:  # a third by something in front, and in pixels without a measurement
+        columns = np.flatnonzero((depth > 0).any(axis=0))
+        depth[:, columns[: len(columns) // 3]] = 0.8 * TRUE[2, 3]
+        depth[rng.uniform(size=depth.shape) < 0.3] = 0
+    image = scene.image._replace(depth=jnp.asarray(depth))
+    for seed in range(3):
+        found = POLISHED(jnp.asarray(moved(TRUE, seed, 2.0, 0.015 * diameter)), on_device, image)
+        assert float(mssd(found, TRUE.astype(np.float32), part.points[:300])) < bound * diameter
+
+
+def test_polishing_leaves_what_nothing_was_measured_of(part: Part, scene: Scene) -> None:
+    on_device, start = device_of(part, np.zeros(MOST, dtype=bool)), moved(TRUE, 0, 2.0, 0.01)
+    behind, elsewhere = start.copy(), start.copy()
+    behind[2, 3] *= -1
+    elsewhere[0, 3] += 3 * part.diameter
+    for pose_, depth in ((start, 0 * scene.image.depth), (behind, scene.image.depth), (elsewhere, scene.image.depth)):
+        found = POLISHED(jnp.asarray(pose_), on_device, scene.image._replace(depth=depth))
+        np.testing.assert_array_equal(found, pose_)
+
+
+def test_polishing_does_not_slide_a_plate_along_itself() -> None:
+    mesh = box((0, 0, 0), (1.0, 0.6, 0.02))
+    plate, flat = of_mesh(mesh), pose((0.05, -0.02, 3.0), np.diag([1.0, -1.0, -1.0]))
+    start = flat.astype(np.float32)
+    start[:3, 3] += [0.01, -0.01, 0.02]
+    found = np.asarray(
+        POLISHED(jnp.asarray(start), device_of(plate, np.zeros(MOST, dtype=bool)), view_of(mesh, flat).image)
+    )
+    np.testing.assert_allclose(found[2, 3], flat[2, 3], atol=1e-3)
+    assert (np.abs(found[:2, 3] - flat[:2, 3]) <= np.abs(start[:2, 3] - flat[:2, 3]) + 1e-3).all()
