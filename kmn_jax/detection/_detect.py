@@ -101,7 +101,7 @@ def detect(
     on_device, warnings = device_part(model, part), scene.warnings
     propose = partial(search_at, model, on_device, scene, random_seed=random_seed, config=search)
     if at is None:
-        meanwhile(partial(refine_any, on_device, scene, search, model.config.num_keypoints))
+        meanwhile(partial(compile_ahead, on_device, scene, search, model.config.num_keypoints))
         found, more = explore(scene, part, propose, probabilities.found, config, clock)
         warnings = (*warnings, *more)
     else:
@@ -164,8 +164,8 @@ def explore(
     return join(rounds), warnings
 
 
-def refine_any(on_device: DevicePart, scene: Scene, config: SearchConfig, num_keypoints: int) -> None:
-    """Judge the poses of a crop that has none, refine some pose and polish it, whose only use is that all is compiled."""
+def compile_ahead(on_device: DevicePart, scene: Scene, config: SearchConfig, num_keypoints: int) -> None:
+    """Judge the poses of a crop that has none, refine some pose and polish it: the only use is that all is compiled."""
     none = no_poses(config.crops, num_keypoints)
     gather_evidence(none, on_device.arrays, on_device.surfels, scene.image, config.agreement)
     pose, row = jax.device_put((np.eye(4, dtype=np.float32), np.int32(0)))
