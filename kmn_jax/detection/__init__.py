@@ -37,7 +37,16 @@ from kmn_jax.detection._depth_agreement import (
     depth_agreement,
     depth_buffer,
 )
-from kmn_jax.detection._detect import THOROUGH, DetectConfig, chosen, detect, detections, explore, refined_candidates
+from kmn_jax.detection._detect import (
+    THOROUGH,
+    DetectConfig,
+    chosen,
+    detect,
+    detections,
+    explore,
+    polished_candidates,
+    refined_candidates,
+)
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place, symmetry_transforms
 from kmn_jax.detection._estimator import PoseEstimator
 from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
@@ -144,6 +153,7 @@ __all__ = [
     "network_prediction",
     "picture_agreement",
     "placed",
+    "polished_candidates",
     "poses_at",
     "poses_in_crop",
     "poses_of_draw",
