@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 import sys
 from contextlib import suppress
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from typing import Any
 import jax
 import tyro
 
+from configs import CONFIGS
 from experiments.evaluation.plots import as_png, new_figure
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
@@ -53,6 +55,7 @@ class Options:
 def release(options: Options) -> list[Path]:
     """Write weights, curve, picture and card, and return their paths."""
     source = options.run / "model.safetensors"
+    _check_made(options, source)
     model = load_model(source)
     rows = read_metrics(options.run)
     config = _json(options.run / "config.json", ("name", "network", "pack", "optimizer", "pipeline"))
@@ -81,6 +84,18 @@ def release(options: Options) -> list[Path]:
     card = _card(name, config, sessions, validated, evaluation, size, digest, poses)
     write_whole(paths[".md"], card.encode())
     return list(paths.values())
+
+
+def _check_made(options: Options, source: Path) -> None:
+    """Raise InputError for weights or an evaluation that have not been made yet, with the command that makes them."""
+    if not source.exists():
+        name = options.run.name if options.run.name in CONFIGS else "NAME"
+        folder = "" if options.run == Path("runs", name) else f" --folder {shlex.quote(str(options.run))}"
+        made_by = f"python -m experiments.train {name}{folder} --resume, which writes them at its first validation"
+        raise InputError(f"{options.run} holds no weights yet: {made_by}")
+    if not options.evaluation.exists():
+        command = shlex.join(["experiments.evaluate_network", str(options.run), "--json", str(options.evaluation)])
+        raise InputError(f"{options.evaluation} has not been made yet: python -m {command}")
 
 
 def _json(path: Path, wanted: tuple[str, ...]) -> dict[str, Any]:

@@ -276,9 +276,9 @@ def _ask(request: Request, server: str, top: int | None, picture: bool) -> Serve
     if request.base_camera is not None or request.grasps is not None:
         raise InputError("a server knows no robot: leave out --base-camera and --grasps, or search here")
     files = (request.object, request.scene, request.camera, request.background)
-    names = ("at", "object_units", "random_seed", "roi", "plane", "thorough", "sensor")
+    names = ("at", "units", "object_units", "random_seed", "roi", "plane", "thorough", "sensor")
     fields = {name: getattr(request, name) for name in names}
-    return detect_on_server(server, *files, request.units, picture, top=top, **fields)
+    return detect_on_server(server, *files, top=top, picture=picture, **fields)
 
 
 class _Session:

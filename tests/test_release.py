@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import site
 import subprocess
 import sys
 import tarfile
@@ -37,7 +39,7 @@ def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert re.findall(r"^version: (.+)$", citation, re.M) == [kmn_jax.__version__]
 
 
-def test_wheel_and_sdist_are_whole_and_the_wheel_imports_in_an_empty_environment(tmp_path: Path) -> None:
+def test_wheel_and_sdist_are_whole_and_the_wheel_works_in_an_environment_of_its_own(tmp_path: Path) -> None:
     build = [sys.executable, "-m", "hatchling", "build", "--directory", str(tmp_path / "dist")]
     subprocess.run(build, cwd=ROOT, check=True, capture_output=True, timeout=100)
     (wheel,), (sdist,) = (list((tmp_path / "dist").glob(f"kmn_jax-{kmn_jax.__version__}{end}")) for end in ENDS)
@@ -63,6 +65,15 @@ def test_wheel_and_sdist_are_whole_and_the_wheel_imports_in_an_empty_environment
     program = "import kmn_jax; print(kmn_jax.__version__, kmn_jax.__file__)"
     ran = subprocess.run([str(python), "-I", "-c", program], capture_output=True, text=True, cwd=tmp_path, timeout=60)
     assert ran.stdout.startswith(f"{kmn_jax.__version__} {tmp_path / 'env'}"), ran.stderr
+    # The command beside it, with the packages of the environment that runs this: not with its kmn_jax.
+    (packages,) = (path.parent for path in (tmp_path / "env").rglob("kmn_jax") if path.is_dir())
+    (packages / "shared.pth").write_text("\n".join(site.getsitepackages()))
+    (command,) = python.parent.glob("kmn*")
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    ran = subprocess.run(
+        [command, "--version"], capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=100
+    )
+    assert (ran.returncode, ran.stdout) == (0, f"kmn {kmn_jax.__version__}\n"), ran.stderr
 
 
 @pytest.mark.parametrize(

@@ -23,10 +23,8 @@ from kmn_jax.serve._metrics import Metrics
 from kmn_jax.serve._page import page
 from kmn_jax.serve._parts import check_name
 from kmn_jax.serve._searches import Question, Searches, Upload
-from kmn_jax.serve._settings import ServeConfig
+from kmn_jax.serve._settings import ServeConfig, Units
 from kmn_jax.serve._worker import Worker
-
-Units = Literal["auto", "mm", "cm", "m", "in"]
 
 _WARMING_UP = "the server is still compiling: ask /health when it is ready"
 _PROBLEMS: dict[int | str, dict[str, Any]] = {

@@ -8,10 +8,10 @@ import secrets
 import urllib.error
 import urllib.parse
 import urllib.request
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from kmn_jax.detection import CropPrediction, Detection, Detections, Timing
 from kmn_jax.errors import InputError
 from kmn_jax.io import read_file, resolve_unit
 from kmn_jax.limits import parse_json
+from kmn_jax.serve._settings import Units
 from kmn_jax.units import METRES
 
 _SECONDS = 600.0  # that an answer is waited for
@@ -41,24 +42,43 @@ def detect_on_server(
     scene: Path,
     camera: Path | None = None,
     background: Path | None = None,
-    units: str = "auto",
+    *,
+    at: str | Sequence[str] = (),
+    units: Units = "auto",
+    object_units: Units = "auto",
+    random_seed: int = 0,
+    roi: str | None = None,
+    plane: Literal["auto", "always", "never"] = "auto",
+    thorough: bool = False,
+    sensor: str | None = None,
+    top: int | None = None,
     picture: bool = False,
-    **fields: Any,
 ) -> ServerAnswer:
     """Search a scan on the server at an address (`kmn serve`), with its network.
 
-    Further fields are those of its request. Raises InputError if a file cannot be read, if no server answers, and for
-    what the server cannot do.
+    Keywords are the fields of its request, which mean what the flags of `kmn detect` do; `at` is X,Y,Z, or several such
+    places, and `picture` asks for one. Raises InputError if a file cannot be read, if no server answers, and for what
+    the server cannot do.
     """
-    if is_bop_image(scene) and camera is None:
-        units = resolve_unit(units, "mm", "mm")  # that the format states
+    states_its_unit = is_bop_image(scene) and camera is None
+    fields = {
+        "at": [at] if isinstance(at, str) else list(at),
+        "units": resolve_unit(units, "mm", "mm") if states_its_unit else units,
+        "object_units": object_units,
+        "random_seed": random_seed,
+        "roi": roi,
+        "plane": plane,
+        "thorough": thorough,
+        "sensor": sensor,
+        "top": top,
+        "picture": picture,
+    }
     files = {"object": (part.name, read_file(part)), "scene": _scan_file(scene, camera)}
     if background is not None:
         files["background"] = _scan_file(background, camera)
     if camera is not None:
         files["camera"] = (camera.name, read_file(camera, "a camera file"))
-    given = {name: value for name, value in fields.items() if value is not None}
-    body, kind = _form({**given, "units": units, "picture": picture}, files)
+    body, kind = _form({name: value for name, value in fields.items() if value is not None}, files)
     content, headers = _request(server, "/detect", body, {"Content-Type": kind})
     try:
         result = dict(_parsed(server, content)) | {"object": str(part), "scene": str(scene)}

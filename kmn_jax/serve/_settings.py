@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 from kmn_jax.errors import require
 
 MEGABYTE = 1_000_000
+Units = Literal["auto", "mm", "cm", "m", "in"]  # that requests may say
 
 
 @dataclass(frozen=True)

@@ -178,3 +178,22 @@ def test_what_cannot_be_read_is_one_sentence(
     message = capsys.readouterr().err
     assert message.startswith("evaluate_network: ")
     assert "nowhere" in message
+
+
+def test_what_has_not_been_made_yet_is_told_with_its_command(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def said(*arguments: str) -> str:
+        assert release.main([*arguments, "--folder", "released"]) == 2
+        return capsys.readouterr().err
+
+    assert "runs/small holds no weights yet: python -m experiments.train small --resume," in said(
+        "runs/small", "a.json"
+    )
+    assert "python -m experiments.train small --folder other/small --resume," in said("other/small", "a.json")
+    assert "python -m experiments.train NAME --folder mine --resume," in said("mine", "a.json")
+    made_by = f"python -m experiments.evaluate_network {run} --json a.json\n"
+    assert said(str(run), "a.json") == f"release: a.json has not been made yet: {made_by}"
+    assert not (tmp_path / "released").exists()

@@ -20,6 +20,7 @@ LONGEST = (
     "data/test_build.py",
     "test_docs.py",
     "experiments/test_evaluate_network.py",
+    "test_docs_commands.py",
     "viz/test_viewer.py",
     "viz/test_viewer_panel.py",
     "train/test_examples.py",

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
 
 from kmn_jax.detection import THOROUGH, as_json
 from kmn_jax.objects import Part
-from kmn_jax.serve import ServeConfig
+from kmn_jax.serve import ServeConfig, detect_on_server
+from kmn_jax.serve._app import detect
 from kmn_jax.serve._messages import DetectionResult, Health, PartInfo, PartList, PoseInfo, Problem
 from kmn_jax.serve._searches import stored_name
 from tests.serve.serve_sample import FOUND, KnownAnswer, Running, eventually, running, some_scan
@@ -281,3 +283,13 @@ def test_it_says_that_it_is_ready_when_all_is_compiled(tmp_path: Path) -> None:
         eventually(lambda: server.ask("GET", "/health")[0] == 200)
         assert server.ask("GET", "/health")[1]["status"] == "ready"
         assert server.send("POST", "/detect", object=b"solid", scene=SCAN)[0] == 200
+
+
+def test_the_client_takes_the_fields_of_a_search() -> None:
+    asked, here = inspect.signature(detect).parameters, inspect.signature(detect_on_server).parameters
+    assert set(here) - {"server"} == set(asked) - {"request", "object"}  # the file `object` is its `part`
+    taken, known = get_type_hints(detect), get_type_hints(detect_on_server)
+    for name in [name for name, keyword in here.items() if keyword.kind is keyword.KEYWORD_ONLY and name != "at"]:
+        assert (known[name], here[name].default) == (taken[name], asked[name].default), name
+    assert list[str] == taken["at"]
+    assert str in get_args(known["at"])
