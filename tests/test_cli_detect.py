@@ -131,6 +131,23 @@ def test_a_cloud_around_a_point(card: Path, cloud: Path, tmp_path: Path) -> None
     assert main(["detect", "--object", str(card), "--scene", str(cloud), *both, "--json", str(target)]) == 0
 
 
+def test_an_object_in_inches_read_as_millimetres_is_told(
+    cloud: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mesh = trimesh.load(MOTOR)
+    mesh.apply_scale(1 / 25.4)
+    mesh.export(tmp_path / "motor.stl")
+    place = ",".join(f"{x:.3f}" for x in np.load(cloud)[100])
+    given = ["--scene", str(IMAGE), "--at", place]
+    assert main(["detect", "--object", str(tmp_path / "motor.stl"), *given]) == 0
+    assert "so that its diameter is 3.17 mm: if its numbers are inches or" in capsys.readouterr().out
+    assert main(["prepare", str(tmp_path / "motor.stl"), "-o", str(tmp_path / "motor.kmn")]) == 0
+    assert main(["detect", "--object", str(tmp_path / "motor.kmn"), *given]) == 0
+    assert "for a card kmn prepare --units" in capsys.readouterr().out
+    assert main(["detect", "--object", str(tmp_path / "motor.stl"), *given, "--object-units", "in"]) == 0
+    assert "unit was taken to be" not in capsys.readouterr().out
+
+
 def test_a_relative_path_and_another_part(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Final, Protocol, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
@@ -19,7 +19,7 @@ from kmn_jax.errors import InputError
 from kmn_jax.geometry import PaddedCloud, pad_cloud
 from kmn_jax.objects import ObjectModel
 
-UNIT = "mm"
+UNIT: Final = "mm"
 _SEED_DRAWS = 5000  # points of a scan whose copy is looked for
 _LABEL_TOLERANCE = 0.02  # of the diameter: a point belongs to the copy whose surface is so near
 _LEAST_VISIBLE = 0.1  # of a copy, where it is known

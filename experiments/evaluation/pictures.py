@@ -22,6 +22,15 @@ _RIGHT, _WRONG, _RIVAL = "tab:green", "tab:red", "tab:blue"
 
 
 @dataclass(frozen=True)
+class Picture:
+    """A PNG file of the report; one with a title comes first, under it."""
+
+    content: bytes
+    title: str = ""
+    text: str = ""
+
+
+@dataclass(frozen=True)
 class RivalPose:
     """What another method found in the same case."""
 

@@ -16,11 +16,12 @@ from experiments.evaluation.cases import Method, ObjectImages
 from experiments.evaluation.chosen import OURS, chosen_cases
 from experiments.evaluation.configs import EvaluateConfig, noise_name
 from experiments.evaluation.methods import Ours
-from experiments.evaluation.pictures import case_grid
+from experiments.evaluation.pictures import Picture, case_grid
 from experiments.evaluation.plots import recall_plot
 from experiments.evaluation.predictions import Export
 from experiments.evaluation.published import MILLISECONDS, RECALL, SOURCE
 from experiments.evaluation.scores import THRESHOLD, Cell, accuracy_rows, object_rows, pooled, recall_rows, seed_rows
+from experiments.evaluation.whole_bin import whole_bin
 from kmn_jax.files import write_whole
 from kmn_jax.report import markdown_table, print_table
 
@@ -59,11 +60,11 @@ class Result:
     commits: Sequence[str]  # that poses were made at, before or now
 
 
-def write_report(folder: Path, result: Result, pictures: Mapping[str, bytes]) -> Path:
+def write_report(folder: Path, result: Result, pictures: Mapping[str, Picture]) -> Path:
     """Write report.md, report.html, scores.json and the pictures; return the page."""
     sections = list(_sections(result))
-    for name, content in pictures.items():
-        write_whole(folder / f"{name}.png", content)
+    for name, picture in pictures.items():
+        write_whole(folder / f"{name}.png", picture.content)
     write_whole(folder / "report.md", _markdown(result, sections, pictures).encode())
     page = folder / "report.html"
     write_whole(page, _page(result, sections, pictures).encode())
@@ -72,15 +73,19 @@ def write_report(folder: Path, result: Result, pictures: Mapping[str, bytes]) ->
     return page
 
 
-def draw_pictures(result: Result, objects: Sequence[ObjectImages], exported: Export) -> dict[str, bytes]:
-    """Return the plot and the grid of cases by the names of their files."""
-    pictures = {"recall": recall_plot(result.cells, result.config.noise)}
+def draw_pictures(result: Result, objects: Sequence[ObjectImages], exported: Export) -> dict[str, Picture]:
+    """Return a whole bin, the plot and the grid of cases by the names of their files."""
+    pictures: dict[str, Picture] = {}
     method = result.methods.get(OURS)
+    searched = whole_bin(objects, result.config.weights) if isinstance(method, Ours) else None
+    if searched is not None:
+        pictures["whole_bin"] = searched
+    pictures["recall"] = Picture(recall_plot(result.cells, result.config.noise))
     if isinstance(method, Ours):
         titles = {key: method.name for key, method in result.methods.items()}
         shown = chosen_cases(result.config, objects, exported, result.cells, titles, _rivals(result))
         if shown:
-            pictures["cases"] = case_grid(method, shown)
+            pictures["cases"] = Picture(case_grid(method, shown))
     return pictures
 
 
@@ -208,27 +213,33 @@ def _facts(result: Result) -> dict[str, str]:
 
 
 def _markdown(
-    result: Result, sections: Sequence[tuple[str, str, list[dict[str, Any]]]], pictures: Mapping[str, bytes]
+    result: Result, sections: Sequence[tuple[str, str, list[dict[str, Any]]]], pictures: Mapping[str, Picture]
 ) -> str:
     parts = [f"# Evaluation: {result.config.name}"]
     parts += filter(None, [_headline(result)])
+    for name, picture in pictures.items():
+        if picture.title:
+            parts += [f"## {picture.title}", picture.text, f"![{name}]({name}.png)"]
     for title, text, rows in sections:
         parts += [f"## {title}", *([text] if text else []), *([markdown_table(rows)] if rows else [])]
-    parts += [f"![{name}]({name}.png)" for name in pictures]
+    parts += [f"![{name}]({name}.png)" for name, picture in pictures.items() if not picture.title]
     parts += [f"## {_ORIGIN}", "\n".join(f"- {key}: {value}" for key, value in _facts(result).items())]
     return "\n\n".join(parts) + "\n"
 
 
 def _page(
-    result: Result, sections: Sequence[tuple[str, str, list[dict[str, Any]]]], pictures: Mapping[str, bytes]
+    result: Result, sections: Sequence[tuple[str, str, list[dict[str, Any]]]], pictures: Mapping[str, Picture]
 ) -> str:
     body = [f"<h1>Evaluation: {html.escape(result.config.name)}</h1>"]
     body.append(f'<p class="headline">{html.escape(_headline(result))}</p>')
-    sources = {name: base64.b64encode(content).decode() for name, content in pictures.items()}
-    drawn = [
-        f'<div class="wide"><img alt="{name}" src="data:image/png;base64,{source}"></div>'
-        for name, source in sources.items()
-    ]
+    drawn = []
+    for name, picture in pictures.items():
+        source = base64.b64encode(picture.content).decode()
+        image = f'<div class="wide"><img alt="{name}" src="data:image/png;base64,{source}"></div>'
+        if picture.title:
+            body += [f"<h2>{html.escape(picture.title)}</h2>", _paragraphs(picture.text), image]
+        else:
+            drawn.append(image)
     for number, (title, text, rows) in enumerate(sections):
         if title == _SETTINGS:
             body += [f"<details><summary>{html.escape(title)}</summary>", _table(rows), "</details>"]
@@ -324,7 +335,10 @@ th, td { border-bottom: 1px solid #ddd; padding: .25rem .6rem; text-align: left;
 th { border-bottom: 2px solid #888; overflow-wrap: break-word; } th:not(:first-child) { min-width: 4rem; }
 td:first-child { white-space: nowrap; }
 img { max-width: 100%; }
-@media (max-width: 800px) { img[alt=cases] { max-width: none; width: 1100px; } }
+@media (max-width: 800px) {
+  img[alt=cases] { max-width: none; width: 1100px; }
+  img[alt=whole_bin] { max-width: none; width: max(100%, 640px); }
+}
 </style>
 </head>
 <body>

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,24 +38,24 @@ def bop_objects(folder: Path, split: str, report: Report, most_images: int | Non
     models, problems = load_models(dataset, OBJECT)
     for problem in (*problems, *map(str, dataset.problems(decode=False))):
         report(problem)
-    keys: dict[int, list[FrameKey]] = {object_id: [] for object_id in models}
+    keys: dict[int, list[tuple[FrameKey, int]]] = {object_id: [] for object_id in models}
     for key in dataset.usable(decode=False):
         try:
             frame = dataset.frame(*key)
         except InputError as error:
             report(str(error))
             continue
-        present = {instance.object_id for instance in frame.instances or ()}
+        present = Counter(instance.object_id for instance in frame.instances or ())
         if not present:
             report(f"{folder.name}: image {key.image_id} of scene {key.scene_id} shows no object")
-        for object_id in sorted(present & set(models)):
-            keys[object_id].append(key)
+        for object_id in sorted(set(present) & set(models)):
+            keys[object_id].append((key, present[object_id]))
     names = {object_id: _names(folder).get(object_id, f"object {object_id}") for object_id in models}
     found = [
         ObjectImages(
             names[object_id],
             replace(model, name=names[object_id]),
-            BopImages(dataset, model, object_id, tuple(_spread(keys[object_id], most_images))),
+            BopImages(dataset, model, object_id, *zip(*_spread(keys[object_id], most_images), strict=True)),
         )
         for object_id, model in models.items()
         if keys[object_id]
@@ -72,6 +73,12 @@ class BopImages:
     model: ObjectModel
     object_id: int
     keys: tuple[FrameKey, ...]
+    counts: tuple[int, ...]  # of copies in each
+
+    @property
+    def fullest(self) -> FrameKey:
+        """The image with the most copies, the first one of several."""
+        return self.keys[self.counts.index(max(self.counts))]
 
     def __len__(self) -> int:
         return len(self.keys)

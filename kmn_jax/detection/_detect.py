@@ -36,6 +36,7 @@ from kmn_jax.detection._seeds import NUM_SEEDS, seeds_at, seeds_over
 from kmn_jax.detection._selection import Selection, select_poses
 from kmn_jax.detection._timing import Clock
 from kmn_jax.errors import InputError
+from kmn_jax.io import object_doubt
 from kmn_jax.models import Model
 from kmn_jax.objects import Part
 from kmn_jax.programs import meanwhile
@@ -126,7 +127,10 @@ def detect(
         accepted = choice.kept & (calibration.probability(found.evidence) >= config.accepted)
         left = unexplained(scene.foreground, scene, part, found.T_camera_object[accepted])
         share, points = left.sum() / scene.foreground.sum(), scene.placed(scene.points[left])
-    reason = None if poses else "; ".join(filter(None, (_reason(found, part), scene.doubt)))
+    doubt = None if accepted.any() else _object_doubt(part, scene)
+    reason = None if poses else "; ".join(filter(None, (_reason(found, part), scene.doubt, doubt)))
+    if poses and doubt is not None:
+        warnings = (*warnings, doubt)
     result = Detections(part.name, scene.unit, poses, clock.timing, reason, warnings)
     if at is not None:
         return result
@@ -298,6 +302,13 @@ def narrowing(evidence: Float[np.ndarray, "a f"], share: float) -> tuple[str, ..
         (share > _MOST_UNEXPLAINED, f"{share:.0%} of the foreground is on no pose that was found"),
     )
     return tuple(text + _NARROW for holds, text in texts if holds)
+
+
+def _object_doubt(part: Part, scene: Scene) -> str | None:
+    """Say which other unit the part may be in, if its own was assumed."""
+    if not part.is_unit_assumed or scene.size is None:
+        return None
+    return object_doubt(part.in_unit("mm").diameter, scene.size, scene_follows=scene.has_unit_of_part)
 
 
 def _reason(found: Candidates, part: Part) -> str:

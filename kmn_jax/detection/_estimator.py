@@ -22,7 +22,15 @@ from kmn_jax.detection._grasps import with_grasps
 from kmn_jax.detection._result import Detection, Detections
 from kmn_jax.detection._scan_frame import base_from_scene, in_base, scan_frame
 from kmn_jax.detection._scene import Scene, make_scene, nearest_row
-from kmn_jax.detection._sources import GraspSource, PartSource, ScanSource, arranged, grasps_of, object_of
+from kmn_jax.detection._sources import (
+    GraspSource,
+    PartSource,
+    ScanSource,
+    arranged,
+    grasps_of,
+    is_unit_assumed,
+    object_of,
+)
 from kmn_jax.detection._timing import Clock
 from kmn_jax.errors import InputError, float_array
 from kmn_jax.io import (
@@ -88,8 +96,8 @@ class PoseEstimator:
 
         `source` is a path (STL, OBJ, PLY, GLB, STEP, PCD, XYZ, or .kmn, a card), an array (n, 3) or (n, 6) of points
         and normals, a pair of vertices (v, 3) and triangles (t, 3), or anything with `vertices` and `faces`. `unit`
-        is that of its numbers, by default millimetres. Cards, STEP and GLB files state theirs: they are converted to
-        `unit`, if it is given. Raises InputError if there is no surface in it.
+        is that of its numbers; without it millimetres are assumed, which the part remembers. Cards, STEP and GLB files
+        state theirs: they are converted to `unit`, if it is given. Raises InputError if there is no surface in it.
         """
         if isinstance(source, str | Path) and Path(source).suffix.lower() == CARD_SUFFIX:
             part = load_part(source, self.digest)
@@ -99,7 +107,8 @@ class PoseEstimator:
                     " with kmn prepare"
                 )
             return part if unit is None else part.in_unit(unit)
-        return make_part(object_of(source, unit, name, _OBJECT), self.model, self.digest)
+        part = make_part(object_of(source, unit, name, _OBJECT), self.model, self.digest)
+        return replace(part, is_unit_assumed=is_unit_assumed(source, unit))
 
     def scene(
         self,
@@ -123,7 +132,8 @@ class PoseEstimator:
         if not parts:
             raise InputError("no object is given to make the scene for")
         smallest, ratio = parts[0], parts[-1].in_unit("m").diameter / parts[0].in_unit("m").diameter
-        read, truth, bop_ids = _read(arranged(scan, K, depth_unit, camera, unit), unit, camera, smallest)
+        given = arranged(scan, K, depth_unit, camera, unit)
+        read, truth, bop_ids = _read(given, unit, camera, smallest)
         frame = scan_frame(read, sensor, T_scene_camera)
         size = scene_size(read)
         problem = length_problem(smallest.diameter, smallest.unit, size)
@@ -142,6 +152,8 @@ class PoseEstimator:
             scene,
             warnings=(*self.warnings, *filter(None, (question,)), *frame.warnings, *scene.warnings),
             doubt=None if is_stated else length_doubt(smallest.diameter, smallest.unit, size),
+            size=size,
+            has_unit_of_part=not is_stated and unit in (None, "auto") and not isinstance(given, Scan),
             truth=truth,
             bop_ids=bop_ids,
             T_scene_sensor=frame.T_scene_sensor,

@@ -15,7 +15,7 @@ from kmn_jax.detection._foreground import ForegroundOptions, foreground
 from kmn_jax.detection._frames import MOST_BEHIND, into, placed
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import Camera, PaddedCloud, intrinsics, pad_cloud
-from kmn_jax.io import FAR, Scan
+from kmn_jax.io import FAR, Scan, SceneSize
 
 MOST_POINTS = 131_072  # of a scan that are searched: more are thinned out at random, fewer are padded
 # Depth images are padded to so many pixels, or else to a multiple of the step: one size compiles nothing for the next.
@@ -41,6 +41,8 @@ class Scene:
     warnings: tuple[str, ...] = ()
     is_narrowed: bool = False  # whether it was told where parts may be: by an empty bin, a region, or the truth
     doubt: str | None = None  # about its unit, told if nothing is found
+    size: SceneSize | None = None  # that a part's unit is doubted by
+    has_unit_of_part: bool = False  # for want of its own
     truth: tuple[Float[np.ndarray, "4 4"], ...] | None = None  # T_scene_object of all copies, if a dataset says
     bop_ids: tuple[int, int, int] = (0, 0, 1)  # scene, image and object, of an image of a BOP dataset
     T_scene_sensor: Float[np.ndarray, "4 4"] | None = None  # of the camera as its user knows it, if that is known

@@ -81,6 +81,11 @@ def grasps_of(given: GraspSource | Sequence[GraspSource | None] | None, count: i
     return [load_grasps(one) if isinstance(one, str | Path) else one for one in each]
 
 
+def is_unit_assumed(source: PartSource, unit: str | None) -> bool:
+    """Tell whether neither `unit` nor a part's file says what its numbers are in: they are taken for millimetres."""
+    return unit is None and not (isinstance(source, str | Path) and stated_unit(source))
+
+
 def object_of(source: PartSource, unit: str | None, name: str | None, config: ObjectConfig) -> ObjectModel:
     """Make an object model of what a part can be given as, see `PoseEstimator.prepare`."""
     if isinstance(source, str | Path):

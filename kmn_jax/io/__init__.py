@@ -5,7 +5,15 @@ from kmn_jax.io._images import ImageHeader, image_header, read_image
 from kmn_jax.io._meshes import CLOUD_SUFFIXES, MESH_SUFFIXES, check_triangles, read_file, read_mesh
 from kmn_jax.io._origin import FAR, far_origin, held, object_origin
 from kmn_jax.io._poses import in_other_unit, pose_matrix, pose_of, read_pose
-from kmn_jax.io._scale import length_doubt, length_problem, resolve_unit, scene_size, size_question
+from kmn_jax.io._scale import (
+    SceneSize,
+    length_doubt,
+    length_problem,
+    object_doubt,
+    resolve_unit,
+    scene_size,
+    size_question,
+)
 from kmn_jax.io._scans import DepthCamera, Scan, depth_scan, read_scan
 from kmn_jax.io._stated import stated_unit
 
@@ -17,6 +25,7 @@ __all__ = [
     "DepthCamera",
     "ImageHeader",
     "Scan",
+    "SceneSize",
     "check_triangles",
     "depth_array_scan",
     "depth_scan",
@@ -26,6 +35,7 @@ __all__ = [
     "in_other_unit",
     "length_doubt",
     "length_problem",
+    "object_doubt",
     "object_origin",
     "pose_matrix",
     "pose_of",

@@ -19,6 +19,7 @@ from kmn_jax.io._scans import Scan
 from kmn_jax.units import METRES, check_unit
 
 AUTO = "auto"
+_ASSUMED = "mm"  # of objects whose files state no unit
 _NAMES = {"mm": "millimetres", "cm": "centimetres", "m": "metres", "in": "inches"}
 _PERCENTILES = (1, 99)  # of each axis: what lies beyond may be stray points
 _SAMPLE = 2_000  # points whose neighbours are looked for
@@ -37,7 +38,7 @@ _REAL_SIZES = (0.0005, 5.0)  # of an object: others bring a question
 _RARE = {"mm": 0.0, "m": 0.2, "in": 0.7, "cm": 1.0}
 _RARE_MISTAKE = {"scene": 0.0, "object": 0.5}
 _DOUBTFUL = 2.5  # units that are more unusual by less may be what a user means where nothing is found
-_CLOSE = 1.0  # candidates that are not much more unusual than the best one are named, too
+_CLOSE = 1.0  # units that are not much more unusual than the best one, or than the one assumed, are named, too
 
 
 @dataclass(frozen=True)
@@ -134,6 +135,28 @@ def length_doubt(diameter: float, object_unit: str, scene: SceneSize) -> str | N
         return None
     names = " or ".join(_NAMES[unit] for unit in units)
     return f"if the scan's lengths are {names}, not {_NAMES[scene.unit]}, say --units {' or '.join(units)}"
+
+
+def object_doubt(diameter: float, scene: SceneSize, *, scene_follows: bool) -> str | None:
+    """Tell in a clause which other units than mm, which were assumed, an object may be in, None if none is as usual.
+
+    `diameter` is in mm, so as it was read. It is for objects whose unit nobody stated, where nothing was found in a
+    scene that they fit. `scene_follows` is whether the scene was read in the object's unit, for want of its own: then
+    that has to be said, too, as else both would change.
+    """
+    most = _oddity(diameter, _ASSUMED, scene) + _CLOSE
+    possible = [unit for unit in METRES if unit != _ASSUMED and _fault(diameter, unit, scene) is None]
+    ranked = sorted((_oddity(diameter, unit, scene), unit) for unit in possible)
+    units = [unit for oddity, unit in ranked if oddity <= most]
+    if not units:
+        return None
+    names = " or ".join(_NAMES[unit] for unit in units)
+    also = f", and --units {scene.unit} for the scan" if scene_follows else ""
+    return (
+        f"the object's unit was taken to be {_ASSUMED}, so that its diameter is {_digits(diameter)} {_ASSUMED}: if its"
+        f" numbers are {names}, say --object-units {' or '.join(units)} (in Python unit=, for a card kmn prepare"
+        f" --units){also}"
+    )
 
 
 def size_question(diameter: float, unit: str, flag: str) -> str | None:

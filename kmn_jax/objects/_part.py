@@ -51,6 +51,7 @@ class Part:
     symmetries: Symmetries
     source_digest: str  # SHA-256 of the file it was made of
     model_digest: str  # of the network that made the features, see `model_digest`
+    is_unit_assumed: bool = False  # whether nobody stated its unit, so that its numbers were taken for millimetres
 
     @property
     def num_keypoints(self) -> int:
@@ -184,6 +185,8 @@ def save_part(part: Part, path: str | Path) -> None:
         "source_digest": part.source_digest,
         "model_digest": part.model_digest,
     }
+    if part.is_unit_assumed:
+        facts["is_unit_assumed"] = True
     content = safetensors_bytes(tensors, {"format": _FORMAT, "facts": json.dumps(facts)})
     if len(content) > _LIMIT:
         raise InputError(
@@ -276,4 +279,5 @@ def _part(tensors: dict[str, np.ndarray], facts: dict[str, object]) -> Part:
         symmetries=symmetries,
         source_digest=str(facts["source_digest"]),
         model_digest=str(facts["model_digest"]),
+        is_unit_assumed=facts.get("is_unit_assumed") is True,  # older cards do not say
     )

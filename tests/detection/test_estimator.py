@@ -289,6 +289,43 @@ def test_a_scan_without_the_part_is_an_empty_or_doubtful_result(estimator: PoseE
     assert reason.endswith("; say --units cm")
 
 
+def test_an_object_whose_unit_was_assumed_is_doubted_where_nothing_is_found(
+    estimator: PoseEstimator, seen: tuple[Scan, np.ndarray], tmp_path: Path
+) -> None:
+    mesh, (scan, _) = read_mesh(MOTOR), seen
+    inches = (mesh.vertices / 25.4, mesh.triangles)
+    assumed, stated = estimator.prepare(inches, name="motor"), estimator.prepare(inches, "mm", "motor")
+    assert (assumed.is_unit_assumed, stated.is_unit_assumed) == (True, False)
+    assert not estimator.prepare(STEP).is_unit_assumed
+    save_part(assumed, tmp_path / "motor.kmn")
+    strict = replace(estimator, config=DetectConfig(reported=0.99, accepted=0.99))
+    doubt = (
+        "; the object's unit was taken to be mm, so that its diameter is 3.17 mm: if its numbers are inches or"
+        " centimetres, say --object-units in or cm (in Python unit=, for a card kmn prepare --units)"
+    )
+    place = scan.points[:1]
+    for part in (assumed, estimator.prepare(tmp_path / "motor.kmn", "m"), stated):
+        assert str(strict.detect(part, scan, at=place).reason).endswith(doubt) == part.is_unit_assumed
+    follows = strict.detect(assumed, scan.points, at=place)  # points state no unit
+    assert str(follows.reason).endswith(f"{doubt}, and --units mm for the scan")
+
+
+def test_the_doubt_about_an_object_is_a_note_if_all_poses_are_doubtful(
+    estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray]
+) -> None:
+    scan, truth = seen
+    place = scan.points[np.linalg.norm(scan.points - truth[0][:3, 3], axis=1).argmin()][None]
+    scene = estimator.scene(scan, motor)
+    assert motor.is_unit_assumed
+    assert scene.size is not None
+    usual_for_inches = replace(scene.size, extent=150 * motor.diameter, distance=200 * motor.diameter)
+    for accepted, noted in ((1.0, True), (0.1, False)):
+        config = DetectConfig(reported=0.0, accepted=accepted)
+        found = replace(estimator, config=config).detect(motor, replace(scene, size=usual_for_inches), at=place)
+        assert len(found.poses) == 1
+        assert any("unit was taken to be mm" in warning for warning in found.warnings) == noted
+
+
 def test_parts_and_scans_may_lie_far_from_the_origin(
     estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray]
 ) -> None:

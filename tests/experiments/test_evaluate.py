@@ -114,7 +114,7 @@ def test_evaluating_twice_gives_the_same_numbers_and_a_report(
     assert "skipped kiss: no_such_rival cannot be imported" in capsys.readouterr().err
 
     page = (tmp_path / "one" / "report.html").read_text()
-    assert page.count('src="data:image/png;base64,') == 2
+    assert page.count('src="data:image/png;base64,') == 3
     assert "http" not in re.sub(r"base64,[^\"]+", "", page).replace("http-equiv", "")
     report = (tmp_path / "one" / "report.md").read_text()
     for text in (page, report):
@@ -123,7 +123,13 @@ def test_evaluating_twice_gives_the_same_numbers_and_a_report(
         assert "Nothing." not in text
         assert "Nowhere." not in text
         found = text.index("kmn_jax + ICP finds the right pose in")
-        assert found < text.index("Recall, objects: ") < text.index("Where, when and of what it was made")
+        whole = re.search(r"(\d+) of (\d+) copies found in this bin, all accepted poses right", text)
+        assert whole is not None
+        assert int(whole[1]) >= int(whole[2]) / 2
+        assert "The image with the most copies of gear_motor" in text
+        assert (
+            found < whole.start() < text.index("Recall, objects: ") < text.index("Where, when and of what it was made")
+        )
 
     own = tmp_path / "one" / "ours" / f"{GEAR}.noise0.safetensors"
     stamp = own.stat().st_mtime_ns

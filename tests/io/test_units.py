@@ -15,6 +15,7 @@ from kmn_jax.io import (
     depth_scan,
     length_doubt,
     length_problem,
+    object_doubt,
     resolve_unit,
     scene_size,
     size_question,
@@ -101,6 +102,30 @@ def test_centimetres_read_as_millimetres_are_told(name: str) -> None:
     told = length_problem(RIGHT[name][0], "mm", shown) or length_doubt(RIGHT[name][0], "mm", shown)
     assert told is not None
     assert "centimetres" in told
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_an_object_in_inches_read_as_millimetres_is_told_and_one_in_millimetres_is_not(name: str) -> None:
+    (diameter, *_), shown = RIGHT[name], scene(RIGHT[name], "mm")
+    read = in_unit(diameter, "in")
+    told = length_problem(read, "mm", shown) or object_doubt(read, shown, scene_follows=False)
+    assert told is not None
+    assert "--object-units" in told
+    if name not in ("small", "coarse"):  # 3 mm in a bin, where 3 inches are more usual
+        assert "inches" in told
+        assert object_doubt(diameter, shown, scene_follows=False) is None
+
+
+def test_the_doubt_about_an_object_as_a_whole() -> None:
+    shown = scene(MOTOR, "mm")
+    said = (
+        "the object's unit was taken to be mm, so that its diameter is 3 mm: if its numbers are inches or centimetres,"
+        " say --object-units in or cm (in Python unit=, for a card kmn prepare --units)"
+    )
+    assert object_doubt(3.0, shown, scene_follows=False) == said
+    assert object_doubt(3.0, shown, scene_follows=True) == f"{said}, and --units mm for the scan"
+    in_metres = scene(MOTOR, "m")
+    assert object_doubt(3.0, in_metres, scene_follows=False) == said
 
 
 @pytest.mark.parametrize(

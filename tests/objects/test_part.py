@@ -45,6 +45,16 @@ def part(shaft: ObjectModel, model: Model) -> Part:
     return make_part(shaft, model)
 
 
+def test_a_card_remembers_that_its_unit_was_assumed_and_older_ones_do_not(part: Part, tmp_path: Path) -> None:
+    save_part(part, tmp_path / "stated.kmn")
+    assert "assumed" not in _facts(tmp_path / "stated.kmn")  # as cards were before
+    assert not load_part(tmp_path / "stated.kmn").is_unit_assumed
+    save_part(replace(part, is_unit_assumed=True), tmp_path / "assumed.kmn")
+    found = load_part(tmp_path / "assumed.kmn")
+    assert found.is_unit_assumed
+    assert found.in_unit("m").is_unit_assumed
+
+
 def test_a_card_comes_back_bit_for_bit(part: Part, model: Model, tmp_path: Path) -> None:
     path = tmp_path / "shaft.kmn"
     save_part(part, path)
