@@ -8,26 +8,20 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-BLOCK = re.compile(r"(?:<!-- given: (?P<given>[^\n]*?) -->\n)?^```python\n(?P<code>.*?)^```$", re.M | re.S)
+BLOCK = re.compile(r"^```python\n(?P<code>.*?)^```$", re.M | re.S)
 EXAMPLES = [
     pytest.param(path, match, id=f"{path.name}-{number}")
     for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
     for number, match in enumerate(BLOCK.finditer(path.read_text(encoding="utf-8")), start=1)
 ]
-ASSETS = ROOT / "experiments" / "assets"
-GIVEN = {  # files that a comment before an example may ask for
-    "part_file": ASSETS / "industrial" / "gear_motor.stl",
-    "small_test_set": ASSETS / "small_test_set",
-}
 
 
 @pytest.fixture
-def like_the_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a folder in which all of the repository seems to lie, but what is written stays; it is where we are."""
+def like_the_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Work in a folder in which all of the repository seems to lie, but what is written stays."""
     for folder in ("benchmarks", "configs", "docs", "experiments", "kmn_jax"):
         (tmp_path / folder).symlink_to(ROOT / folder)
     monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 def test_every_room_has_its_page_of_the_reference() -> None:
@@ -39,10 +33,9 @@ def test_every_room_has_its_page_of_the_reference() -> None:
         assert f"api/{room}.md\n" in nav
 
 
+@pytest.mark.usefixtures("like_the_root")
 @pytest.mark.parametrize(("path", "block"), EXAMPLES)
-def test_example_runs(path: Path, block: re.Match[str], like_the_root: Path) -> None:
+def test_example_runs(path: Path, block: re.Match[str]) -> None:
     line = path.read_text(encoding="utf-8").count("\n", 0, block.start("code"))
     code = compile("\n" * line + block["code"], str(path), "exec")
-    for name in [name.strip() for name in (block["given"] or "").split(",") if name.strip()]:
-        (like_the_root / GIVEN[name].name).symlink_to(GIVEN[name])
     exec(code, {"__name__": "__main__"})
