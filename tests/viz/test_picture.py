@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kmn_jax.detection import CropPrediction, Detection, Detections, Scene
+from kmn_jax.detection import CropPrediction, Detection, Detections, Scene, warnings_once
 from kmn_jax.errors import InputError
 from kmn_jax.objects import Part, Symmetries
 from kmn_jax.viz import TRUTH_COLORS, distinct_colors, save_picture, truth_codes
-from kmn_jax.viz._legend import UNEXPLAINED, warnings_once
+from kmn_jax.viz._legend import UNEXPLAINED
 from kmn_jax.viz._raster import Canvas
 from kmn_jax.viz._truth import BACKGROUND, FALSE_PART, MISSED, RIGHT, WRONG_KEYPOINT, surface_distances
 from tests.detection.box_sample import CAMERA, POSES, SIZES, both_boxes, box_part, box_view
