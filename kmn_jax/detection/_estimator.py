@@ -36,6 +36,7 @@ from kmn_jax.errors import InputError, float_array
 from kmn_jax.io import (
     CameraMatrix,
     Scan,
+    camera_question,
     held,
     length_doubt,
     length_problem,
@@ -316,7 +317,10 @@ class PoseEstimator:
                 with clock("grasps"):
                     found = with_grasps(found, way, parts[number], scene, T_base_scene)
                 found = replace(found, timing=found.timing.and_then(clock.timing))
-            results[number] = found if T_base_scene is None else in_base(found, T_base_scene)
+            if T_base_scene is not None:
+                away = float(np.linalg.norm(np.asarray(T_base_camera, dtype=np.float64)[:3, 3]))
+                found = in_base(found, T_base_scene, camera_question(away, scene.unit, parts[number].diameter))
+            results[number] = found
         return results[0] if isinstance(part, Part) else tuple(results)
 
 

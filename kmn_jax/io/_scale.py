@@ -35,6 +35,9 @@ _POINTS_ACROSS = 3.0
 _USUAL_EXTENT, _USUAL_DISTANCE = (0.7, 20.0), (3.0, 40.0)
 _USUAL_SIZES = {"object": (0.003, 0.5), "scene": (0.03, 2.0), "distance": (0.15, 3.0)}
 _REAL_SIZES = (0.0005, 5.0)  # of an object: others bring a question
+_NEAR_BASE = 0.1  # diameters of the part: a camera so near to a robot's base brings a question, ...
+_FAR_FROM_BASE = 100.0  # metres: ... as does one so far away, ...
+_USUAL_REACH = (0.1, 10.0)  # metres: ... if it would be there in another unit
 _RARE = {"mm": 0.0, "m": 0.2, "in": 0.7, "cm": 1.0}
 _RARE_MISTAKE = {"scene": 0.0, "object": 0.5}
 _DOUBTFUL = 2.5  # units that are more unusual by less may be what a user means where nothing is found
@@ -156,6 +159,23 @@ def object_doubt(diameter: float, scene: SceneSize, *, scene_follows: bool) -> s
         f"the object's unit was taken to be {_ASSUMED}, so that its diameter is {_digits(diameter)} {_ASSUMED}: if its"
         f" numbers are {names}, say --object-units {' or '.join(units)} (in Python unit=, for a card kmn prepare"
         f" --units){also}"
+    )
+
+
+def camera_question(distance: float, unit: str, diameter: float) -> str | None:
+    """Ask whether a camera is really so near to a robot's base, or so far from it, None if it may be.
+
+    `diameter` is that of the part, in the same unit; a camera exactly at the base's origin is meant to be there.
+    """
+    is_odd = distance < _NEAR_BASE * diameter or distance * METRES[check_unit(unit)] > _FAR_FROM_BASE
+    low, high = _USUAL_REACH
+    likely = sorted((_RARE[other], other) for other in METRES if low <= distance * METRES[other] <= high)
+    if not is_odd or not likely or unit in (other for _, other in likely):
+        return None
+    other = likely[0][1]
+    return (
+        f"the camera would be {_digits(distance)} {unit} from the robot's base: is T_base_camera in {_NAMES[other]}?"
+        f' Then give its lengths in {unit}, or say "unit": "{other}" in its file'
     )
 
 

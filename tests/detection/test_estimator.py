@@ -127,7 +127,9 @@ def test_places_and_crops_give_the_pose_there(
     seed = max(whole.poses, key=lambda pose: pose.probability).seed
     other = scan.points[np.linalg.norm(scan.points - seed, axis=1).argmax()]
     scene = estimator.scene(scan, motor, at=np.stack([seed, other]))
-    there = estimator.detect(motor, scene, at=seed, top=1)
+    there = estimator.detect(motor, scene, at=seed, top=1, T_base_camera=placed((0.3, 0, 1.2), np.eye(3)))  # metres
+    (warning,) = (text for text in there.warnings if "robot's base" in text)
+    assert warning.startswith("the camera would be 1.24 mm from the robot's base: is T_base_camera in metres? ")
     assert errors(there.poses[0].T_scene_object, truth, motor).min() < 0.1
     both = estimator.detect(motor, scene, at=np.stack([seed, other]))
     assert len(both.poses) <= 2

@@ -79,6 +79,7 @@ def test_poses_in_the_robot_s_frame() -> None:
         assert copy.T_base_object is not None
         np.testing.assert_allclose(copy.T_base_object, T_base_scene @ T_scene_object)
         assert copy.to_dict()["T_base_object"] == copy.T_base_object.tolist()
+    assert in_base(found, T_base_scene, "is it so?").warnings == (*found.warnings, "is it so?")
     with pytest.raises(InputError, match="give T_scene_camera in place of the sensor's place"):
         base_from_scene(T_base_camera, None, False)
 

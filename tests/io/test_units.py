@@ -12,6 +12,7 @@ from kmn_jax.errors import InputError
 from kmn_jax.io import (
     DepthCamera,
     Scan,
+    camera_question,
     depth_scan,
     length_doubt,
     length_problem,
@@ -250,3 +251,16 @@ def test_other_files_state_metres_or_nothing(tmp_path: Path) -> None:
     assert stated_unit("part.stl") is None
     with pytest.raises(InputError, match="cannot be read"):
         stated_unit(tmp_path / "none.step")
+
+
+def test_a_camera_at_the_robot_s_base_is_asked_about() -> None:
+    assert camera_question(0.8, "mm", 60.0) == (
+        "the camera would be 0.8 mm from the robot's base: is T_base_camera in metres? Then give its lengths in mm, or"
+        ' say "unit": "m" in its file'
+    )
+    far = camera_question(800.0, "m", 0.06)
+    assert far is not None
+    assert "800 m from the robot's base: is T_base_camera in millimetres?" in far
+    for distance, unit in ((0.0, "mm"), (800.0, "mm"), (0.8, "m"), (7.0, "mm"), (0.01, "mm"), (1e6, "m")):
+        assert camera_question(distance, unit, in_unit(60.0, unit)) is None
+    assert camera_question(150.0, "mm", 2000.0) is None
