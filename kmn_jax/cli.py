@@ -92,7 +92,7 @@ def prepare(
     part = PoseEstimator.from_pretrained(weights).prepare(source, _unit(units))
     save_part(part, target)
     say(f"{describe(part)}; wrote {target}")
-    question = size_question(part.diameter, part.unit, "--units")
+    question = size_question(part.diameter, part.unit, "--units {}")
     if question is not None:
         say(f"note: {question}")
 

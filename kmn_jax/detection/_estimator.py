@@ -30,6 +30,7 @@ from kmn_jax.detection._sources import (
     grasps_of,
     is_unit_assumed,
     object_of,
+    unit_words,
 )
 from kmn_jax.detection._timing import Clock
 from kmn_jax.errors import InputError, float_array
@@ -137,11 +138,12 @@ class PoseEstimator:
         read, truth, bop_ids = _read(given, unit, camera, smallest)
         frame = scan_frame(read, sensor, T_scene_camera)
         size = scene_size(read)
-        problem = length_problem(smallest.diameter, smallest.unit, size)
+        words = unit_words(scan, K, unit)
+        problem = length_problem(smallest.diameter, smallest.unit, size, words)
         if problem is not None:
             raise InputError(problem)
         is_stated = camera is None and isinstance(scan, str | Path) and is_bop_image(scan)
-        question = size_question(smallest.diameter, smallest.unit, "--object-units")
+        question = size_question(smallest.diameter, smallest.unit, words.object)
         options = background or ForegroundOptions()
         # Margins are those of the smallest part, but a plane is background only if it is no part's.
         options = replace(options, least_extent=options.least_extent * ratio)

@@ -45,6 +45,17 @@ _CLOSE = 1.0  # units that are not much more unusual than the best one, or than 
 
 
 @dataclass(frozen=True)
+class UnitWords:
+    """What says the unit of a scene's and of an object's lengths, with {} for mm, cm, m or in; by default flags."""
+
+    scene: str = "--units {}"
+    object: str = "--object-units {}"
+
+
+_FLAGS = UnitWords()
+
+
+@dataclass(frozen=True)
 class SceneSize:
     """How large a scene is, in `unit`."""
 
@@ -90,11 +101,12 @@ def scene_size(scan: Scan) -> SceneSize:
     return SceneSize(float(np.linalg.norm(high - low)), spacing, distance, scan.unit)
 
 
-def length_problem(diameter: float, object_unit: str, scene: SceneSize) -> str | None:
+def length_problem(diameter: float, object_unit: str, scene: SceneSize, words: UnitWords = _FLAGS) -> str | None:
     """Tell in a sentence why an object of that diameter cannot be in a scene, None if it can.
 
     If another unit makes them fit, of the scene or else of the object, the sentence names the most usual one with its
-    factor, and others that would do as well. Raises InputError for an unknown unit or a diameter of zero or less.
+    factor, others that would do as well, and by `words` what to say. Raises InputError for an unknown unit or a
+    diameter of zero or less.
     """
     if not 0 < diameter < math.inf:
         raise InputError(f"diameter is {diameter}, but must be above zero and finite")
@@ -117,10 +129,10 @@ def length_problem(diameter: float, object_unit: str, scene: SceneSize) -> str |
     change = f"{factor:.4g} times larger" if factor > 1 else f"{1 / factor:.4g} times smaller"
     others = ", ".join(f"{_NAMES[name]} for the {what}" for oddity, what, name in rest if oddity < least + _CLOSE)
     too = f" ({others} would fit, too)" if others else ""
-    say = f"say --units {unit}"
+    say = f"say {words.scene.format(unit)}"
     if which == "object":
         again = f"a card is made again by kmn prepare --units {unit}, a GLB or STEP file is to be exported again"
-        say = f"say --object-units {unit} ({again})"
+        say = f"say {words.object.format(unit)} ({again})"
     return f"{fault}: the {which} would fit {change}, so its lengths are probably {_NAMES[unit]}{too}: {say}"
 
 
@@ -179,14 +191,14 @@ def camera_question(distance: float, unit: str, diameter: float) -> str | None:
     )
 
 
-def size_question(diameter: float, unit: str, flag: str) -> str | None:
-    """Ask whether an object is really so small or large, None if many are; `flag` is what says the unit otherwise."""
+def size_question(diameter: float, unit: str, words: str) -> str | None:
+    """Ask whether an object is really so small or large, None if many are; `words`, with {}, say another unit."""
     metres = diameter * METRES[check_unit(unit)]
     if _REAL_SIZES[0] <= metres <= _REAL_SIZES[1]:
         return None
     low, high = _USUAL_SIZES["object"]
     likely = sorted((_RARE[other], other) for other in METRES if low <= diameter * METRES[other] <= high)
-    remedy = f" If its numbers are {_NAMES[likely[0][1]]}, say {flag} {likely[0][1]}" if likely else ""
+    remedy = f" If its numbers are {_NAMES[likely[0][1]]}, say {words.format(likely[0][1])}" if likely else ""
     return f"is the object really {_digits(diameter)} {unit} large?{remedy}"
 
 
