@@ -81,10 +81,5 @@ def _rotation_vector(rotation: np.ndarray) -> np.ndarray:
 def describe(part: Part) -> str:
     """Return name, size and symmetry of a part for people."""
     x, y, z = part.maximum - part.minimum
-    found = part.symmetries
-    if len(found.axes):
-        alike = "turns about an axis look the same" if len(found.axes) == 1 else "looks the same from all sides"
-    else:
-        alike = f"{len(found.rotations)} poses look the same" if part.is_symmetric else "no symmetry"
     size = f"{x:.4g} x {y:.4g} x {z:.4g} {part.unit}, diameter {part.diameter:.4g} {part.unit}"
-    return f"{part.name}: {size}, {alike}"
+    return f"{part.name}: {size}, {part.symmetries}"
