@@ -92,7 +92,7 @@ def prepare(
     part = PoseEstimator.from_pretrained(weights).prepare(source, _unit(units))
     save_part(part, target)
     say(f"{describe(part)}; wrote {target}")
-    question = size_question(part.diameter, part.unit, "--units")
+    question = size_question(part.diameter, part.unit, "--units {}")
     if question is not None:
         say(f"note: {question}")
 
@@ -123,9 +123,11 @@ def detect(
     read = (request.camera, request.background, request.base_camera, request.grasps, Path(request.weights))
     check_outputs((json, bop_csv, save_picture), request.object, request.scene, *read, *bop_files(request.scene))
     if save_picture is not None:
-        from kmn_jax.viz import check_picture
+        from kmn_jax.viz import check_drawing, check_picture
 
         check_picture(save_picture)
+        if server is None:
+            check_drawing()
     if server is None:
         session = _Session(request)
         found, bop_ids = session.detect(session.places, top), session.scene.bop_ids

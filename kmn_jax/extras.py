@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, requires, version
 
 _FIRST = "detect"  # what every command with a part and a scan needs
-_OTHERS = ("view", "plots", "serve", "data", "train")
+_OTHERS = ("plots", "view", "serve", "data", "train")  # those that others take in come first
 _PACKAGE_OF = {"PIL": "pillow", "OpenEXR": "openexr"}  # modules that are not called as their package
 _REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(?:\[(?P<extras>[\w,-]+)\])?(?P<bounds>[^;]*)(?:;(?P<marker>.*))?")
 

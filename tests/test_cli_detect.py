@@ -233,6 +233,23 @@ def test_bad_input_is_one_sentence_and_exit_2(
     assert (tmp_path / "part.stl").read_bytes() == MOTOR.read_bytes()
 
 
+def test_what_pictures_need_is_asked_for_before_the_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def search(request: object) -> None:
+        raise AssertionError("searched")
+
+    monkeypatch.setattr("kmn_jax.cli._Session", search)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    outputs = ["--json", str(tmp_path / "a.json"), "--save-picture", str(tmp_path / "a.png")]
+    assert main(["detect", "--object", str(MOTOR), "--scene", str(IMAGE), *outputs]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("kmn: pictures need packages that are not installed: pip install ")
+    assert "matplotlib" in said
+    assert "viser" not in said
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_results_are_written_though_nobody_reads_the_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

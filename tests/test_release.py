@@ -82,6 +82,7 @@ def test_wheel_and_sdist_are_whole_and_the_wheel_works_in_an_environment_of_its_
         ("scipy.spatial", ("no-such-package>=4", "scipy>=1.15")),
         ("no_such_package", ("no-such-package>=4",)),
         ("no_such_viewer", ("no-such-package>=4", "no-such-viewer>=1.1")),
+        ("matplotlib", ("matplotlib>=3.10", "no-such-package>=4")),  # not the viewer, which takes it in
         ("somebody_elses", ("somebody-elses",)),
     ],
 )

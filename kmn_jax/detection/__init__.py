@@ -58,7 +58,7 @@ from kmn_jax.detection._kept_parts import prepare_kept
 from kmn_jax.detection._mapping import call_rows, map_real, map_rows
 from kmn_jax.detection._output import as_json, describe, table, write_bop_csv, write_json
 from kmn_jax.detection._picture_agreement import PictureAgreement, picture_agreement
-from kmn_jax.detection._result import CropPrediction, Detection, Detections, Pick, Timing
+from kmn_jax.detection._result import CropPrediction, Detection, Detections, Pick, Timing, pose_notes, warnings_once
 from kmn_jax.detection._scene import MOST_POINTS, Scene, make_scene
 from kmn_jax.detection._search import (
     Candidates,
@@ -154,6 +154,7 @@ __all__ = [
     "picture_agreement",
     "placed",
     "polished_candidates",
+    "pose_notes",
     "poses_at",
     "poses_in_crop",
     "poses_of_draw",
@@ -177,6 +178,7 @@ __all__ = [
     "surface_scores",
     "symmetry_transforms",
     "table",
+    "warnings_once",
     "with_grasps",
     "write_bop_csv",
     "write_json",

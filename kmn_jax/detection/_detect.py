@@ -52,7 +52,10 @@ _NARROW = (
     ": on walls, rims and tables poses may be wrong though they are called probable; give the scan without parts"
     " (--background), or the box that parts are in (--roi)"
 )
-_RIVALLED = "another pose in this place is nearly as probable: the object may lie the other way round"
+_RIVALLED = (
+    "another pose in this place is nearly as probable: the object may be turned about its axis or lie the other way"
+    " round"
+)
 
 
 @dataclass(frozen=True)

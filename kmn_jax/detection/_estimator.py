@@ -30,12 +30,14 @@ from kmn_jax.detection._sources import (
     grasps_of,
     is_unit_assumed,
     object_of,
+    unit_words,
 )
 from kmn_jax.detection._timing import Clock
 from kmn_jax.errors import InputError, float_array
 from kmn_jax.io import (
     CameraMatrix,
     Scan,
+    camera_question,
     held,
     length_doubt,
     length_problem,
@@ -136,11 +138,12 @@ class PoseEstimator:
         read, truth, bop_ids = _read(given, unit, camera, smallest)
         frame = scan_frame(read, sensor, T_scene_camera)
         size = scene_size(read)
-        problem = length_problem(smallest.diameter, smallest.unit, size)
+        words = unit_words(scan, K, unit)
+        problem = length_problem(smallest.diameter, smallest.unit, size, words)
         if problem is not None:
             raise InputError(problem)
         is_stated = camera is None and isinstance(scan, str | Path) and is_bop_image(scan)
-        question = size_question(smallest.diameter, smallest.unit, "--object-units")
+        question = size_question(smallest.diameter, smallest.unit, words.object)
         options = background or ForegroundOptions()
         # Margins are those of the smallest part, but a plane is background only if it is no part's.
         options = replace(options, least_extent=options.least_extent * ratio)
@@ -316,7 +319,10 @@ class PoseEstimator:
                 with clock("grasps"):
                     found = with_grasps(found, way, parts[number], scene, T_base_scene)
                 found = replace(found, timing=found.timing.and_then(clock.timing))
-            results[number] = found if T_base_scene is None else in_base(found, T_base_scene)
+            if T_base_scene is not None:
+                away = float(np.linalg.norm(np.asarray(T_base_camera, dtype=np.float64)[:3, 3]))
+                found = in_base(found, T_base_scene, camera_question(away, scene.unit, parts[number].diameter))
+            results[number] = found
         return results[0] if isinstance(part, Part) else tuple(results)
 
 

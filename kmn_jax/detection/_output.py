@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from kmn_jax.bop import BopEstimate, write_results
-from kmn_jax.detection._result import Detection, Detections
+from kmn_jax.detection._result import Detection, Detections, pose_notes
 from kmn_jax.files import write_whole
 from kmn_jax.objects import Part
 from kmn_jax.units import place_text
@@ -54,7 +54,7 @@ def table(found: Detections, accepted: float) -> str:
             rows = [(*row, cell) for row, cell in zip(rows, last, strict=True)]
         widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
         lines += ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
-        lines += sorted({f"note: {warning}" for pose in found.poses for warning in pose.warnings})
+        lines += [f"note: {note}" for note in pose_notes(found)]
     else:
         lines.append(f"{found.part}: nothing found, because {found.reason}")
     if found.unexplained is not None:
@@ -81,10 +81,5 @@ def _rotation_vector(rotation: np.ndarray) -> np.ndarray:
 def describe(part: Part) -> str:
     """Return name, size and symmetry of a part for people."""
     x, y, z = part.maximum - part.minimum
-    found = part.symmetries
-    if len(found.axes):
-        alike = "turns about an axis look the same" if len(found.axes) == 1 else "looks the same from all sides"
-    else:
-        alike = f"{len(found.rotations)} poses look the same" if part.is_symmetric else "no symmetry"
     size = f"{x:.4g} x {y:.4g} x {z:.4g} {part.unit}, diameter {part.diameter:.4g} {part.unit}"
-    return f"{part.name}: {size}, {alike}"
+    return f"{part.name}: {size}, {part.symmetries}"

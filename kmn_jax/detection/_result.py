@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 SCHEMA_VERSION = 1  # of the JSON form, see docs/detect.md
 _SHOWN = 12  # poses in what is printed of a result: it should fit on a screen
+_RUNS = 8  # of ranks that a warning is told with
 
 
 @dataclass(frozen=True)
@@ -154,4 +155,43 @@ class Detections:
         lines += [f"{rank:4d}. {pose!r}" for rank, pose in enumerate(self.poses[:_SHOWN], start=1)]
         lines += [f"      and {len(self.poses) - _SHOWN} more"] if len(self.poses) > _SHOWN else []
         lines += [f"      nothing found, because {self.reason}"] if not self.poses else []
-        return "\n".join([*lines, *(f"      note: {warning}" for warning in self.warnings)])
+        return "\n".join([*lines, *(f"      note: {note}" for note in (*self.warnings, *pose_notes(self)))])
+
+
+def pose_notes(found: Detections) -> list[str]:
+    """Return what poses are warned of, each warning once, after the ranks of its poses."""
+    return [_note(text, ranks) for text, ranks in _warned(found).items()]
+
+
+def warnings_once(found: Detections) -> tuple[list[str], list[list[str]]]:
+    """Return the warnings of the whole, each once, and those that only one pose has, by pose.
+
+    What several poses are warned of is one line of the first list.
+    """
+    warned = _warned(found)
+    several = [_note(text, ranks) for text, ranks in warned.items() if len(ranks) > 1]
+    own = [[text for text, ranks in warned.items() if ranks == [rank]] for rank in range(1, len(found.poses) + 1)]
+    return [*dict.fromkeys(found.warnings), *several], own
+
+
+def _warned(found: Detections) -> dict[str, list[int]]:
+    """Return the ranks of the poses that have each warning, but for those of the whole."""
+    ranks: dict[str, list[int]] = {}
+    for rank, pose in enumerate(found.poses, start=1):
+        for text in dict.fromkeys(pose.warnings):
+            if text not in found.warnings:
+                ranks.setdefault(text, []).append(rank)
+    return ranks
+
+
+def _note(text: str, ranks: Sequence[int]) -> str:
+    """Return a warning after ascending ranks, with a range for three or more in a row; of many, the first ones."""
+    runs: list[list[int]] = []
+    for rank in ranks:
+        if runs and rank == runs[-1][-1] + 1:
+            runs[-1].append(rank)
+        else:
+            runs.append([rank])
+    shown, more = runs[:_RUNS], sum(map(len, runs[_RUNS:]))
+    those = ", ".join(f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in shown)
+    return f"pose{'s' if len(ranks) > 1 else ''} {those}{f' and {more} more' if more else ''}: {text}"

@@ -72,7 +72,7 @@ def base_from_scene(
     return pose @ np.linalg.inv(T_scene_sensor)
 
 
-def in_base(found: Detections, T_base_scene: Float[np.ndarray, "4 4"]) -> Detections:
-    """Return a result with the poses of its copies in the robot's frame, too."""
+def in_base(found: Detections, T_base_scene: Float[np.ndarray, "4 4"], question: str | None = None) -> Detections:
+    """Return a result with the poses of its copies in the robot's frame, too, and a warning if there is a question."""
     poses = tuple(replace(pose, T_base_object=T_base_scene @ pose.T_scene_object) for pose in found.poses)
-    return replace(found, poses=poses)
+    return replace(found, poses=poses, warnings=(*found.warnings, *filter(None, (question,))))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 import numpy as np
 
 from kmn_jax.errors import InputError
-from kmn_jax.io import CameraMatrix, Scan, depth_array_scan, stated_unit
+from kmn_jax.io import CameraMatrix, Scan, UnitWords, depth_array_scan, stated_unit
 from kmn_jax.objects import (
     Grasps,
     ObjectConfig,
@@ -67,6 +67,14 @@ def arranged(
     if camera is not None or unit is not None:
         raise InputError("K and depth_unit say all that camera and unit would: leave these out")
     return depth_array_scan(scan, K, depth_unit)
+
+
+def unit_words(scan: ScanSource, K: CameraMatrix | None, unit: str | None) -> UnitWords:
+    """Return what says the units of part and scan in such a call: the command's, and only it, has a unit of files."""
+    if isinstance(scan, str | Path) and unit is not None:
+        return UnitWords()
+    by = "unit" if K is None else "depth_unit"
+    return UnitWords(f'{by}="{{}}"' + (" of the Scan" if isinstance(scan, Scan) else ""), 'unit="{}" to prepare')
 
 
 def grasps_of(given: GraspSource | Sequence[GraspSource | None] | None, count: int) -> list[Grasps | None]:

@@ -7,6 +7,8 @@ from kmn_jax.io._origin import FAR, far_origin, held, object_origin
 from kmn_jax.io._poses import in_other_unit, pose_matrix, pose_of, read_pose
 from kmn_jax.io._scale import (
     SceneSize,
+    UnitWords,
+    camera_question,
     length_doubt,
     length_problem,
     object_doubt,
@@ -26,6 +28,8 @@ __all__ = [
     "ImageHeader",
     "Scan",
     "SceneSize",
+    "UnitWords",
+    "camera_question",
     "check_triangles",
     "depth_array_scan",
     "depth_scan",

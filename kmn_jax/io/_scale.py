@@ -35,10 +35,24 @@ _POINTS_ACROSS = 3.0
 _USUAL_EXTENT, _USUAL_DISTANCE = (0.7, 20.0), (3.0, 40.0)
 _USUAL_SIZES = {"object": (0.003, 0.5), "scene": (0.03, 2.0), "distance": (0.15, 3.0)}
 _REAL_SIZES = (0.0005, 5.0)  # of an object: others bring a question
+_NEAR_BASE = 0.1  # diameters of the part: a camera so near to a robot's base brings a question, ...
+_FAR_FROM_BASE = 100.0  # metres: ... as does one so far away, ...
+_USUAL_REACH = (0.1, 10.0)  # metres: ... if it would be there in another unit
 _RARE = {"mm": 0.0, "m": 0.2, "in": 0.7, "cm": 1.0}
 _RARE_MISTAKE = {"scene": 0.0, "object": 0.5}
 _DOUBTFUL = 2.5  # units that are more unusual by less may be what a user means where nothing is found
 _CLOSE = 1.0  # units that are not much more unusual than the best one, or than the one assumed, are named, too
+
+
+@dataclass(frozen=True)
+class UnitWords:
+    """What says the unit of a scene's and of an object's lengths, with {} for mm, cm, m or in; by default flags."""
+
+    scene: str = "--units {}"
+    object: str = "--object-units {}"
+
+
+_FLAGS = UnitWords()
 
 
 @dataclass(frozen=True)
@@ -87,11 +101,12 @@ def scene_size(scan: Scan) -> SceneSize:
     return SceneSize(float(np.linalg.norm(high - low)), spacing, distance, scan.unit)
 
 
-def length_problem(diameter: float, object_unit: str, scene: SceneSize) -> str | None:
+def length_problem(diameter: float, object_unit: str, scene: SceneSize, words: UnitWords = _FLAGS) -> str | None:
     """Tell in a sentence why an object of that diameter cannot be in a scene, None if it can.
 
     If another unit makes them fit, of the scene or else of the object, the sentence names the most usual one with its
-    factor, and others that would do as well. Raises InputError for an unknown unit or a diameter of zero or less.
+    factor, others that would do as well, and by `words` what to say. Raises InputError for an unknown unit or a
+    diameter of zero or less.
     """
     if not 0 < diameter < math.inf:
         raise InputError(f"diameter is {diameter}, but must be above zero and finite")
@@ -114,10 +129,10 @@ def length_problem(diameter: float, object_unit: str, scene: SceneSize) -> str |
     change = f"{factor:.4g} times larger" if factor > 1 else f"{1 / factor:.4g} times smaller"
     others = ", ".join(f"{_NAMES[name]} for the {what}" for oddity, what, name in rest if oddity < least + _CLOSE)
     too = f" ({others} would fit, too)" if others else ""
-    say = f"say --units {unit}"
+    say = f"say {words.scene.format(unit)}"
     if which == "object":
         again = f"a card is made again by kmn prepare --units {unit}, a GLB or STEP file is to be exported again"
-        say = f"say --object-units {unit} ({again})"
+        say = f"say {words.object.format(unit)} ({again})"
     return f"{fault}: the {which} would fit {change}, so its lengths are probably {_NAMES[unit]}{too}: {say}"
 
 
@@ -159,14 +174,31 @@ def object_doubt(diameter: float, scene: SceneSize, *, scene_follows: bool) -> s
     )
 
 
-def size_question(diameter: float, unit: str, flag: str) -> str | None:
-    """Ask whether an object is really so small or large, None if many are; `flag` is what says the unit otherwise."""
+def camera_question(distance: float, unit: str, diameter: float) -> str | None:
+    """Ask whether a camera is really so near to a robot's base, or so far from it, None if it may be.
+
+    `diameter` is that of the part, in the same unit; a camera exactly at the base's origin is meant to be there.
+    """
+    is_odd = distance < _NEAR_BASE * diameter or distance * METRES[check_unit(unit)] > _FAR_FROM_BASE
+    low, high = _USUAL_REACH
+    likely = sorted((_RARE[other], other) for other in METRES if low <= distance * METRES[other] <= high)
+    if not is_odd or not likely or unit in (other for _, other in likely):
+        return None
+    other = likely[0][1]
+    return (
+        f"the camera would be {_digits(distance)} {unit} from the robot's base: is T_base_camera in {_NAMES[other]}?"
+        f' Then give its lengths in {unit}, or say "unit": "{other}" in its file'
+    )
+
+
+def size_question(diameter: float, unit: str, words: str) -> str | None:
+    """Ask whether an object is really so small or large, None if many are; `words`, with {}, say another unit."""
     metres = diameter * METRES[check_unit(unit)]
     if _REAL_SIZES[0] <= metres <= _REAL_SIZES[1]:
         return None
     low, high = _USUAL_SIZES["object"]
     likely = sorted((_RARE[other], other) for other in METRES if low <= diameter * METRES[other] <= high)
-    remedy = f" If its numbers are {_NAMES[likely[0][1]]}, say {flag} {likely[0][1]}" if likely else ""
+    remedy = f" If its numbers are {_NAMES[likely[0][1]]}, say {words.format(likely[0][1])}" if likely else ""
     return f"is the object really {_digits(diameter)} {unit} large?{remedy}"
 
 

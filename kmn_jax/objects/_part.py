@@ -30,7 +30,7 @@ _LIMIT = 1_000_000  # bytes of a card
 _ROUNDING = 1e-3  # diameters by which float32 may move a point
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Part:
     """An object to look for. Lengths are in `unit`, in the object's own frame.
 
@@ -52,6 +52,10 @@ class Part:
     source_digest: str  # SHA-256 of the file it was made of
     model_digest: str  # of the network that made the features, see `model_digest`
     is_unit_assumed: bool = False  # whether nobody stated its unit, so that its numbers were taken for millimetres
+
+    def __repr__(self) -> str:
+        counts = f"{len(self.points)} points, {self.num_keypoints} keypoints"
+        return f"Part({self.name}: diameter {self.diameter:.4g} {self.unit}, {counts}, {self.symmetries})"
 
     @property
     def num_keypoints(self) -> int:

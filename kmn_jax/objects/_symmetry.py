@@ -52,6 +52,11 @@ class Symmetries:
         result[:, :3, 3] = self.center - self.rotations @ self.center
         return result
 
+    def __str__(self) -> str:
+        if len(self.axes):
+            return "turns about an axis look the same" if len(self.axes) == 1 else "looks the same from all sides"
+        return f"{len(self.rotations)} poses look the same" if len(self.rotations) > 1 else "no symmetry"
+
 
 def find_symmetries(
     points: Float[np.ndarray, "n 3"],

@@ -27,7 +27,7 @@ from kmn_jax.detection import (
 from kmn_jax.errors import InputError, number_list
 from kmn_jax.objects import Part
 from kmn_jax.serve._parts import PartStore
-from kmn_jax.units import check_unit
+from kmn_jax.units import Unit, check_unit
 
 _MOST_PICTURES = 16  # the last ones, which can be fetched
 _PIECE = 1 << 20  # bytes
@@ -121,7 +121,7 @@ class Searches:
             region = OrientedBox.of_numbers(region)
         sensor = None if asked.sensor is None else np.array(number_list(asked.sensor, "sensor", 3))
         at = np.array(places) if places else None
-        units = None if asked.units == "auto" else check_unit(asked.units)
+        units: Unit | Literal["auto"] = "auto" if asked.units == "auto" else check_unit(asked.units)
         with self._written(asked.camera, "camera") as camera:
             empty = None
             if asked.background is not None:

@@ -79,8 +79,11 @@ def make_world(key: PRNGKey, part: Surfels, other: Surfels, diameter: Scalar, co
     """Draw a world of copies of a part, in some of them among parts of another kind.
 
     Args:
-        part, other: surfels in their own frames, as many of both; `other` is scaled to about the part's size.
+        key: of all randomness.
+        part: surfels in its own frame.
+        other: as many, of the other kind, in its own frame; they are scaled to about the part's size.
         diameter: of the part.
+        config: how worlds are drawn.
     """
     keys = jax.random.split(key, 10)
     is_foreign = _foreign_slots(keys[0], config)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from kmn_jax.detection import DetectConfig, Detections
+from kmn_jax.detection import DetectConfig, Detections, pose_notes
 from kmn_jax.geometry import Camera
 from kmn_jax.objects import Part
 from kmn_jax.viz._raster import Canvas
@@ -30,39 +29,6 @@ def summary(found: Detections) -> str:
         return found.reason or "no pose was found"
     count, likely = len(found.poses), sum(pose.probability >= LIKELY for pose in found.poses)
     return f"{count} pose{'s' if count > 1 else ''}, {likely} of them likely"
-
-
-def warnings_once(found: Detections) -> tuple[list[str], list[list[str]]]:
-    """Return the warnings of the whole, each once, and those that only one pose has, by pose.
-
-    What several poses are warned of is one line of the first list.
-    """
-    common = list(dict.fromkeys(found.warnings))
-    ranks: dict[str, list[int]] = {}
-    for rank, pose in enumerate(found.poses, start=1):
-        for text in dict.fromkeys(pose.warnings):
-            ranks.setdefault(text, []).append(rank)
-    common += [
-        f"poses {_ranges(those)}: {text}"
-        for text, those in ranks.items()
-        if len(those) > 1 and text not in found.warnings
-    ]
-    own = [
-        [text for text in dict.fromkeys(pose.warnings) if len(ranks[text]) == 1 and text not in found.warnings]
-        for pose in found.poses
-    ]
-    return common, own
-
-
-def _ranges(ranks: Sequence[int]) -> str:
-    """Return ascending ranks as text, with a range for three or more in a row."""
-    runs: list[list[int]] = []
-    for rank in ranks:
-        if runs and rank == runs[-1][-1] + 1:
-            runs[-1].append(rank)
-        else:
-            runs.append([rank])
-    return ", ".join(f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in runs)
 
 
 def center_of(part: Part) -> Float[np.ndarray, "3"]:
@@ -102,8 +68,7 @@ def draw_list(axis: Any, found: Detections) -> None:
         axis.text(0, row, "■", fontsize=12, va="center", color=color)
         gray = "black" if pose.probability >= LIKELY else "0.5"
         axis.text(0.1, row, line, fontsize=9, va="center", color=gray, family="monospace")
-    notes, own = warnings_once(found)
-    notes += [f"{rank}: {note}" for rank, those in enumerate(own, start=1) for note in those]
+    notes = [*dict.fromkeys(found.warnings), *pose_notes(found)]
     if len(found.poses) > _LISTED:
         notes.insert(0, f"and {len(found.poses) - _LISTED} more poses")
     if len(notes) > _LISTED_WARNINGS:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import textwrap
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,12 @@ def check_picture(path: str | Path) -> None:
         raise InputError(f"{path} cannot be written: pictures are PNG files, name one that ends with .png")
 
 
+def check_drawing() -> None:
+    """Raise InputError if matplotlib is not installed."""
+    if find_spec("matplotlib") is None:
+        raise InputError(f"pictures need packages that are not installed: {install_command('matplotlib')}")
+
+
 def save_picture(
     path: str | Path,
     view: Scene,
@@ -66,10 +73,8 @@ def save_picture(
     to, or if matplotlib is not installed.
     """
     check_picture(path)
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise InputError(f"pictures need packages that are not installed: {install_command('matplotlib')}") from None
+    check_drawing()
+    from matplotlib.figure import Figure
 
     part = part.in_unit(found.unit)
     panels = _Panels(view, part, found)

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from kmn_jax.detection import Detection, Detections, placed
+from kmn_jax.detection import Detection, Detections, placed, warnings_once
 from kmn_jax.objects import Part
-from kmn_jax.viz._legend import LIKELY, warnings_once
+from kmn_jax.viz._legend import LIKELY
 from kmn_jax.viz._shading import distinct_colors
 from kmn_jax.viz._viewer_scene import PageScene, PoseNodes
 from kmn_jax.viz._viewer_text import details, facts

@@ -68,10 +68,11 @@ class Door:
 
 
 def check_page(host: str, port: int) -> None:
-    """Raise InputError if no page can be served there: the port is in use, or viser is not installed."""
+    """Raise InputError if no page can be served there: the port is in use, or viser or matplotlib is not there."""
     listen(host, port).close()
-    if find_spec("viser") is None:
-        raise InputError(f"the page needs packages that are not installed: {install_command('viser')}")
+    for package in ("viser", "matplotlib"):
+        if find_spec(package) is None:
+            raise InputError(f"the page needs packages that are not installed: {install_command(package)}")
 
 
 def start_server(host: str, port: int) -> tuple[Any, str]:

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from kmn_jax.detection import Detection, Detections
+from kmn_jax.detection import Detection, Detections, warnings_once
 from kmn_jax.units import place_text
-from kmn_jax.viz._legend import summary, warnings_once
+from kmn_jax.viz._legend import summary
 from kmn_jax.viz._shading import as_bytes
 
 _LEAST_COMPILING = 0.05  # seconds that are told

@@ -127,11 +127,11 @@ def test_places_and_crops_give_the_pose_there(
     seed = max(whole.poses, key=lambda pose: pose.probability).seed
     other = scan.points[np.linalg.norm(scan.points - seed, axis=1).argmax()]
     scene = estimator.scene(scan, motor, at=np.stack([seed, other]))
-    there = estimator.detect(motor, scene, at=seed, top=1)
+    there = estimator.detect(motor, scene, at=seed, top=1, T_base_camera=placed((0.3, 0, 1.2), np.eye(3)))  # metres
+    assert any("1.24 mm from the robot's base: is T_base_camera in metres?" in text for text in there.warnings)
     assert errors(there.poses[0].T_scene_object, truth, motor).min() < 0.1
     both = estimator.detect(motor, scene, at=np.stack([seed, other]))
-    assert len(both.poses) <= 2
-    assert both.unexplained is None
+    assert (len(both.poses) <= 2, both.unexplained) == (True, None)
     poses = np.stack([pose.T_scene_object for pose in both.poses])
     assert (poses == there.poses[0].T_scene_object).all(axis=(1, 2)).any(), "whatever else is asked for"
 
@@ -219,7 +219,7 @@ def test_what_cannot_be_is_one_sentence(
     estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray], tmp_path: Path
 ) -> None:
     scan, _ = seen
-    with pytest.raises(InputError, match=r"say --units|metres"):
+    with pytest.raises(InputError, match=r'probably millimetres: say unit="mm"$'):
         estimator.detect(motor, scan.points, unit="m")
     with pytest.raises(InputError, match="region of interest"):
         estimator.detect(motor, scan, background=ForegroundOptions(roi=(1e6, 1e6, 1e6, 2e6, 2e6, 2e6)))

@@ -85,8 +85,21 @@ def test_results_as_values_and_as_text_of_one_screen() -> None:
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 120
     assert "200 poses" in lines[0]
-    assert lines[-2:] == ["      and 188 more", "      note: the scan is coarse"]
+    assert lines[-3:-1] == ["      and 188 more", "      note: the scan is coarse"]
+    assert lines[-1] == "      note: poses 2, 4, 6, 8, 10, 12, 14, 16 and 92 more: few of its matches <agree>"
     assert "nothing found, because it is dark" in repr(replace(found(), reason="it is dark"))
+
+
+def test_what_poses_are_warned_of_is_told_after_their_ranks() -> None:
+    few = both_boxes(PART, VIEW)
+    warned = [("is symmetric", "is rivalled"), ("is symmetric",), (), ("is symmetric", "is rivalled"), ("is coarse",)]
+    poses = tuple(replace(few.poses[0], warnings=(*texts, "is dark")) for texts in warned)
+    result = replace(few, poses=poses, warnings=("is dark",))
+    notes = ["poses 1, 2, 4: is symmetric", "poses 1, 4: is rivalled", "pose 5: is coarse"]
+    assert repr(result).splitlines()[6:] == [f"      note: {note}" for note in ["is dark", *notes]]
+    said = table(result, 0.5).splitlines()
+    assert [line for line in said if line.startswith("note: ")] == [f"note: {note}" for note in ["is dark", *notes]]
+    assert "poses 1 to 3: is symmetric" in repr(replace(result, poses=(poses[0], poses[1], poses[0])))
 
 
 def test_the_table_is_in_the_robot_s_frame_if_that_is_known() -> None:

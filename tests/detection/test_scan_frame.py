@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from kmn_jax.detection import PoseEstimator
 from kmn_jax.detection._scan_frame import base_from_scene, in_base, scan_frame
-from kmn_jax.detection._sources import arranged
+from kmn_jax.detection._sources import arranged, unit_words
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import Camera
-from kmn_jax.io import Scan
-from tests.detection.box_sample import POSES, both_boxes, box_part, box_view
+from kmn_jax.io import Scan, UnitWords
+from tests.detection.box_sample import CAMERA, POSES, both_boxes, box_part, box_view
 from tests.reference.meshes import pose, random_rotations
 
 AHEAD = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 3], (200, 3)).astype(np.float32)
@@ -79,6 +81,7 @@ def test_poses_in_the_robot_s_frame() -> None:
         assert copy.T_base_object is not None
         np.testing.assert_allclose(copy.T_base_object, T_base_scene @ T_scene_object)
         assert copy.to_dict()["T_base_object"] == copy.T_base_object.tolist()
+    assert in_base(found, T_base_scene, "is it so?").warnings == (*found.warnings, "is it so?")
     with pytest.raises(InputError, match="give T_scene_camera in place of the sensor's place"):
         base_from_scene(T_base_camera, None, False)
 
@@ -103,3 +106,15 @@ def test_arrays_are_taken_for_what_they_are() -> None:
     for arguments, message in cases:
         with pytest.raises(InputError, match=message):
             arranged(*arguments)
+
+
+def test_units_are_said_as_the_call_can() -> None:
+    in_python = 'unit="{}" to prepare'
+    assert unit_words("scan.ply", None, "auto") == UnitWords("--units {}", "--object-units {}")
+    assert unit_words("scan.ply", None, None) == unit_words(AHEAD, None, "mm") == UnitWords('unit="{}"', in_python)
+    assert unit_words(AHEAD, np.eye(3), None) == UnitWords('depth_unit="{}"', in_python)
+    assert unit_words(cloud(AHEAD), None, None) == UnitWords('unit="{}" of the Scan', in_python)
+    estimator: Any = SimpleNamespace(warnings=())
+    depth = np.rint(1000 * box_view().depth)
+    with pytest.raises(InputError, match=r'probably millimetres: say depth_unit="mm"$'):
+        PoseEstimator.scene(estimator, depth, box_part(), K=CAMERA.matrix)

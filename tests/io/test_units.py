@@ -12,6 +12,7 @@ from kmn_jax.errors import InputError
 from kmn_jax.io import (
     DepthCamera,
     Scan,
+    camera_question,
     depth_scan,
     length_doubt,
     length_problem,
@@ -222,12 +223,12 @@ def test_clouds_are_measured_alike_however_large(monkeypatch: pytest.MonkeyPatch
 
 
 def test_an_object_of_an_odd_size_brings_a_question() -> None:
-    assert size_question(0.058, "mm", "--units") == (
+    assert size_question(0.058, "mm", "--units {}") == (
         "is the object really 0.058 mm large? If its numbers are metres, say --units m"
     )
-    assert size_question(60_000.0, "cm", "--object-units") == "is the object really 60000 cm large?"
+    assert size_question(60_000.0, "cm", "--object-units {}") == "is the object really 60000 cm large?"
     for diameter, unit in ((58.0, "mm"), (0.058, "m"), (2.0, "in"), (0.6, "mm"), (4.0, "m")):
-        assert size_question(diameter, unit, "--units") is None
+        assert size_question(diameter, unit, "--units {}") is None
 
 
 @pytest.mark.parametrize(
@@ -250,3 +251,16 @@ def test_other_files_state_metres_or_nothing(tmp_path: Path) -> None:
     assert stated_unit("part.stl") is None
     with pytest.raises(InputError, match="cannot be read"):
         stated_unit(tmp_path / "none.step")
+
+
+def test_a_camera_at_the_robot_s_base_is_asked_about() -> None:
+    assert camera_question(0.8, "mm", 60.0) == (
+        "the camera would be 0.8 mm from the robot's base: is T_base_camera in metres? Then give its lengths in mm, or"
+        ' say "unit": "m" in its file'
+    )
+    far = camera_question(800.0, "m", 0.06)
+    assert far is not None
+    assert "800 m from the robot's base: is T_base_camera in millimetres?" in far
+    for distance, unit in ((0.0, "mm"), (800.0, "mm"), (0.8, "m"), (7.0, "mm"), (0.01, "mm"), (1e6, "m")):
+        assert camera_question(distance, unit, in_unit(60.0, unit)) is None
+    assert camera_question(150.0, "mm", 2000.0) is None

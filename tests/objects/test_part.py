@@ -75,6 +75,15 @@ def test_a_card_comes_back_bit_for_bit(part: Part, model: Model, tmp_path: Path)
     assert part.is_symmetric == (len(part.symmetries.rotations) > 1 or len(part.symmetries.axes) > 0)
 
 
+def test_a_part_is_printed_in_a_line(part: Part) -> None:
+    assert repr(part) == str(part) == "Part(shaft: diameter 80.38 mm, 256 points, 8 keypoints, no symmetry)"
+    plain = part.symmetries
+    turned = replace(plain, rotations=np.concatenate([plain.rotations, plain.rotations]))
+    texts = [str(replace(plain, axes=np.eye(3)[:count])) for count in (1, 3)]
+    assert texts == ["turns about an axis look the same", "looks the same from all sides"]
+    assert "2 poses look the same" in repr(replace(part, symmetries=turned))
+
+
 def test_the_digest_is_of_parameters_wherever_they_come_from(model: Model, tmp_path: Path) -> None:
     save_model(model, tmp_path / "model.safetensors")
     assert model_digest(load_model(tmp_path / "model.safetensors")) == model_digest(model)

@@ -135,7 +135,8 @@ def test_a_page_that_the_door_does_not_guard_is_stopped(monkeypatch: pytest.Monk
     assert len(stopped) == 1
 
 
-def test_without_viser_a_command_that_installs_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(InputError, match=r"needs packages that are not installed: pip install .*viser"):
+@pytest.mark.parametrize("package", ["viser", "matplotlib"])
+def test_without_a_package_a_command_that_installs_it_is_named(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(InputError, match=rf"needs packages that are not installed: pip install .*{package}"):
         start_server("127.0.0.1", 0)

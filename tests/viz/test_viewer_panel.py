@@ -16,10 +16,9 @@ import pytest
 import trimesh
 
 import kmn_jax.cli
-from kmn_jax.detection import Detections, OrientedBox, Pick, Scene
+from kmn_jax.detection import Detections, OrientedBox, Pick, Scene, warnings_once
 from kmn_jax.errors import InputError, number_list
 from kmn_jax.viz import PartMesh, Viewer, distinct_colors, one_after_the_other, part_mesh
-from kmn_jax.viz._legend import warnings_once
 from kmn_jax.viz._viewer_poses import rank_of_same
 from kmn_jax.viz._viewer_scene import _GRASP
 from kmn_jax.viz._viewer_text import heading
