@@ -43,8 +43,8 @@ def serve(
 
     Parts of a folder are prepared before; `started` is told the address. While an example scan, or else one that is
     made up, is searched for the first part, which compiles everything, the server answers that it is not ready. After
-    the address, `told` gets a line for each card that was not made from the file beside it. Raises InputError if a part
-    or the example cannot be used, or if the port is in use.
+    the address, `told` gets a line for each part that may not be what its user thinks, one when the server is ready,
+    and one when it stops. Raises InputError if a part or the example cannot be used, or if the port is in use.
     """
     import uvicorn
 
@@ -74,8 +74,20 @@ def serve(
                 stopping[0].should_exit = True
                 raise
 
-        app = make_app(Searches(estimator, weights, store, folder), config, warm_up)
-        server = stoppable(uvicorn.Server(uvicorn_config(app, config)))
+        def tell_later(line: str) -> None:
+            with contextlib.suppress(InputError):  # what cannot be printed is no reason to leave a request unanswered
+                told(line)
+
+        def ready() -> None:
+            if not stopping[0].should_exit:
+                tell_later("ready: all that searches need is compiled")
+
+        def stop() -> None:
+            if not failures:
+                tell_later("stopping: answering what is in flight")
+
+        app = make_app(Searches(estimator, weights, store, folder), config, warm_up, ready)
+        server = stoppable(uvicorn.Server(uvicorn_config(app, config)), stop)
         stopping.append(server)
         started(address(config.host, listening.getsockname()[1]))
         for note in notes:
@@ -110,8 +122,12 @@ def uvicorn_config(app: Any, config: ServeConfig) -> Any:
     )
 
 
-def stoppable(server: Any) -> Any:
-    """Return a uvicorn server that SIGTERM and SIGINT end as if it had nothing more to do: its own dies of them."""
+def stoppable(server: Any, stop: Callable[[], None] = lambda: None) -> Any:
+    """Return a uvicorn server that SIGTERM and SIGINT end as if it had nothing more to do: its own dies of them.
+
+    `stop` is called before it ends, outside of the signals' handlers, which may not print.
+    """
+    shutdown = server.shutdown
 
     @contextlib.contextmanager
     def handled() -> Iterator[None]:
@@ -126,7 +142,11 @@ def stoppable(server: Any) -> Any:
             for number, handler in before.items():
                 signal.signal(number, handler)
 
-    server.capture_signals = handled
+    async def shut_down(sockets: Any = None) -> None:
+        stop()
+        await shutdown(sockets)
+
+    server.capture_signals, server.shutdown = handled, shut_down
     return server
 
 

@@ -95,7 +95,8 @@ def test_the_command_answers_ends_when_told_and_leaves_nothing_behind(tmp_path: 
         out, error = process.communicate(timeout=60)
         for thread in threads:
             thread.join(60)
-        assert (process.returncode, out, error) == (0, "", "")
+        said = "ready: all that searches need is compiled\nstopping: answering what is in flight\n"
+        assert (process.returncode, out, error) == (0, said, "")
         assert [answer.startswith(b"HTTP/1.1 200") for answer in answers] == [True, True]
         assert list(folder.iterdir()) == []
     finally:
