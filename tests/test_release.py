@@ -51,7 +51,8 @@ def test_wheel_and_sdist_are_whole_and_the_wheel_imports_in_an_empty_environment
     assert "kmn_jax/py.typed" in names
     assert {Path(name).name for name in names if "/licenses/" in name} == {"LICENSE", "NOTICE"}
     assert not any(name.startswith(("tests/", "experiments/")) for name in names)
-    assert "License-Expression: Apache-2.0" in said
+    assert "License-Expression: Apache-2.0\n" in said
+    assert "Author: The kmn_jax authors\n" in said
     assert "kmn = kmn_jax.__main__:main" in commands
     with tarfile.open(sdist) as archive:
         inside = {name.partition("/")[2] for name in archive.getnames()}
