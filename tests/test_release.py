@@ -56,7 +56,10 @@ def test_wheel_and_sdist_are_whole_and_the_wheel_imports_in_an_empty_environment
     assert "kmn = kmn_jax.__main__:main" in commands
     with tarfile.open(sdist) as archive:
         inside = {name.partition("/")[2] for name in archive.getnames()}
-    assert {"pyproject.toml", "CHANGELOG.md", "LICENSE", "NOTICE", "kmn_jax/__init__.py", "tests/conftest.py"} <= inside
+    assert {"pyproject.toml", "LICENSE", "kmn_jax/__init__.py", "tests/conftest.py", "docs/client.cpp"} <= inside
+    linked = re.findall(r"\]\(([^):#]+)(?:#[^)]*)?\)", (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert {"CHANGELOG.md", "CONTRIBUTING.md", "NOTICE", "docs/detect.md", "docs/bin.png"} <= set(linked) <= inside
+    assert sdist.stat().st_size < 5_000_000
     venv.create(tmp_path / "env", with_pip=False)
     python = next(path for folder in ("bin", "Scripts") for path in (tmp_path / "env" / folder).glob("python*"))
     install = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-index", "--no-deps"]
