@@ -215,7 +215,7 @@ def serve(
 
     require(bool(np.isfinite(max_megabytes)), f"--max-megabytes is {max_megabytes}, but must be finite")
     limits = ServeConfig(host, port, allow_host, int(1e6 * max_megabytes), max_queue, time_limit)
-    run(limits, weights, parts, example, camera, lambda url: say(f"serving on {url}; stop with Ctrl+C"))
+    run(limits, weights, parts, example, camera, lambda url: say(f"serving on {url}; stop with Ctrl+C"), say)
 
 
 def export(

@@ -53,11 +53,15 @@ def test_wheel_and_sdist_are_whole_and_the_wheel_works_in_an_environment_of_its_
     assert "kmn_jax/py.typed" in names
     assert {Path(name).name for name in names if "/licenses/" in name} == {"LICENSE", "NOTICE"}
     assert not any(name.startswith(("tests/", "experiments/")) for name in names)
-    assert "License-Expression: Apache-2.0" in said
+    assert "License-Expression: Apache-2.0\n" in said
+    assert "Author: The kmn_jax authors\n" in said
     assert "kmn = kmn_jax.__main__:main" in commands
     with tarfile.open(sdist) as archive:
         inside = {name.partition("/")[2] for name in archive.getnames()}
-    assert {"pyproject.toml", "CHANGELOG.md", "LICENSE", "NOTICE", "kmn_jax/__init__.py", "tests/conftest.py"} <= inside
+    assert {"pyproject.toml", "LICENSE", "kmn_jax/__init__.py", "tests/conftest.py", "docs/client.cpp"} <= inside
+    linked = re.findall(r"\]\(([^):#]+)(?:#[^)]*)?\)", (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert {"CHANGELOG.md", "CONTRIBUTING.md", "NOTICE", "docs/detect.md", "docs/bin.png"} <= set(linked) <= inside
+    assert sdist.stat().st_size < 5_000_000
     venv.create(tmp_path / "env", with_pip=False)
     python = next(path for folder in ("bin", "Scripts") for path in (tmp_path / "env" / folder).glob("python*"))
     install = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-index", "--no-deps"]

@@ -57,8 +57,13 @@ class Service:
         return await self.worker.run(job, functools.partial(_gone, request))
 
 
-def make_app(searches: Searches, config: ServeConfig, warm_up: Callable[[], Any] | None = None) -> FastAPI:
-    """Return an ASGI application; it is ready when `warm_up` has returned."""
+def make_app(
+    searches: Searches,
+    config: ServeConfig,
+    warm_up: Callable[[], Any] | None = None,
+    ready: Callable[[], None] = lambda: None,
+) -> FastAPI:
+    """Return an ASGI application; it is ready when `warm_up` has returned, and then calls `ready`."""
     service = Service(searches, config)
 
     @asynccontextmanager
@@ -67,6 +72,7 @@ def make_app(searches: Searches, config: ServeConfig, warm_up: Callable[[], Any]
             if warm_up is not None:
                 warm_up()
             service.is_ready = True
+            ready()
 
         warming = service.worker.start(warm)
         yield

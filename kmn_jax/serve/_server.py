@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
 import logging
 import math
 import signal
@@ -36,12 +37,14 @@ def serve(
     example: Path | None = None,
     camera: Path | None = None,
     started: Callable[[str], None] = lambda url: None,
+    told: Callable[[str], None] = lambda line: None,
 ) -> None:
     """Answer requests until SIGTERM or SIGINT, then those that are under way, and return.
 
     Parts of a folder are prepared before; `started` is told the address. While an example scan, or else one that is
-    made up, is searched for the first part, which compiles everything, the server answers that it is not ready. Raises
-    InputError if a part or the example cannot be used, or if the port is in use.
+    made up, is searched for the first part, which compiles everything, the server answers that it is not ready. After
+    the address, `told` gets a line for each part that may not be what its user thinks, one when the server is ready,
+    and one when it stops. Raises InputError if a part or the example cannot be used, or if the port is in use.
     """
     import uvicorn
 
@@ -52,7 +55,8 @@ def serve(
     listening = listen(config.host, config.port)
     with contextlib.closing(listening), private_folder() as folder:
         estimator = PoseEstimator.from_pretrained(weights)
-        named = {} if parts is None else _prepared(estimator, parts, config.most_parts)
+        notes: list[str] = []
+        named = {} if parts is None else _prepared(estimator, parts, config.most_parts, notes.append)
         store = PartStore(config.most_parts, named)
         scan: Scan | None = None
         if example is not None:
@@ -70,10 +74,24 @@ def serve(
                 stopping[0].should_exit = True
                 raise
 
-        app = make_app(Searches(estimator, weights, store, folder), config, warm_up)
-        server = stoppable(uvicorn.Server(uvicorn_config(app, config)))
+        def tell_later(line: str) -> None:
+            with contextlib.suppress(InputError):  # what cannot be printed is no reason to leave a request unanswered
+                told(line)
+
+        def ready() -> None:
+            if not stopping[0].should_exit:
+                tell_later("ready: all that searches need is compiled")
+
+        def stop() -> None:
+            if not failures:
+                tell_later("stopping: answering what is in flight")
+
+        app = make_app(Searches(estimator, weights, store, folder), config, warm_up, ready)
+        server = stoppable(uvicorn.Server(uvicorn_config(app, config)), stop)
         stopping.append(server)
         started(address(config.host, listening.getsockname()[1]))
+        for note in notes:
+            told(note)
         server.run(sockets=[listening])
     if failures:
         raise failures[0]
@@ -104,8 +122,12 @@ def uvicorn_config(app: Any, config: ServeConfig) -> Any:
     )
 
 
-def stoppable(server: Any) -> Any:
-    """Return a uvicorn server that SIGTERM and SIGINT end as if it had nothing more to do: its own dies of them."""
+def stoppable(server: Any, stop: Callable[[], None] = lambda: None) -> Any:
+    """Return a uvicorn server that SIGTERM and SIGINT end as if it had nothing more to do: its own dies of them.
+
+    `stop` is called before it ends, outside of the signals' handlers, which may not print.
+    """
+    shutdown = server.shutdown
 
     @contextlib.contextmanager
     def handled() -> Iterator[None]:
@@ -120,7 +142,11 @@ def stoppable(server: Any) -> Any:
             for number, handler in before.items():
                 signal.signal(number, handler)
 
-    server.capture_signals = handled
+    async def shut_down(sockets: Any = None) -> None:
+        stop()
+        await shutdown(sockets)
+
+    server.capture_signals, server.shutdown = handled, shut_down
     return server
 
 
@@ -139,18 +165,40 @@ def search_all(estimator: PoseEstimator, part: Part | None, scan: Scan | None) -
         save_picture(Path(folder, "picture.png"), scene, used, found)
 
 
-def _prepared(estimator: PoseEstimator, folder: Path, most: int) -> dict[str, Part]:
-    """Return the parts of a folder's files by their names."""
+def _prepared(
+    estimator: PoseEstimator, folder: Path, most: int, told: Callable[[str], None] = lambda line: None
+) -> dict[str, Part]:
+    """Return the parts of a folder's files by their names; where a card lies beside a CAD file, the card's.
+
+    `told` gets a line for each card that was not made from the file beside it.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: name one that holds CAD files or cards")
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in _PART_SUFFIXES)
     if not files:
         raise InputError(f"{folder} holds no part: put CAD files or cards into it ({', '.join(_PART_SUFFIXES)})")
-    if len(files) > most:
-        raise InputError(f"{folder} holds {len(files)} parts, but at most {most} are kept: leave some out")
-    named: dict[str, Part] = {}
+    cards: dict[str, Path] = {}
+    sources: dict[str, Path] = {}
     for path in files:
-        if path.stem in named:
-            raise InputError(f"{folder} holds two files for the part {path.stem}: remove one")
-        named[check_name(path.stem)] = estimator.prepare(path)
+        alike = cards if path.suffix.lower() == CARD_SUFFIX else sources
+        if path.stem in alike:
+            other = alike[path.stem].name
+            raise InputError(f"{folder} holds two files for the part {path.stem}, {other} and {path.name}: remove one")
+        alike[path.stem] = path
+    used = sources | cards
+    if len(used) > most:
+        raise InputError(f"{folder} holds {len(used)} parts, but at most {most} are kept: leave some out")
+    named: dict[str, Part] = {}
+    for name, path in sorted(used.items()):
+        part = named[check_name(name)] = estimator.prepare(path)
+        source = sources.get(name, path)
+        if source != path and part.source_digest != _digest(source):
+            told(f"the part {name} is that of {path.name}, which was not made from {source.name} as it is now")
     return named
+
+
+def _digest(path: Path) -> str | None:
+    """Return a file's SHA-256, or nothing if it cannot be read."""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+    return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -13,14 +14,17 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from kmn_jax.cli import main
 from kmn_jax.errors import InputError
+from kmn_jax.objects import Part
 from kmn_jax.serve import ServeConfig
 from kmn_jax.serve._server import _prepared, uvicorn_config
 from tests.serve.serve_sample import KnownAnswer, form, running, some_scan
@@ -91,7 +95,8 @@ def test_the_command_answers_ends_when_told_and_leaves_nothing_behind(tmp_path: 
         out, error = process.communicate(timeout=60)
         for thread in threads:
             thread.join(60)
-        assert (process.returncode, out, error) == (0, "", "")
+        said = "ready: all that searches need is compiled\nstopping: answering what is in flight\n"
+        assert (process.returncode, out, error) == (0, said, "")
         assert [answer.startswith(b"HTTP/1.1 200") for answer in answers] == [True, True]
         assert list(folder.iterdir()) == []
     finally:
@@ -135,6 +140,29 @@ def test_too_many_parts_are_refused_before_any_is_prepared(tmp_path: Path) -> No
         (tmp_path / f"{number}.stl").write_bytes(b"broken")
     with pytest.raises(InputError, match="holds 3 parts, but at most 2 are kept"):
         _prepared(KnownAnswer(), tmp_path, 2)
+
+
+def test_a_card_is_used_before_the_file_beside_it(tmp_path: Path) -> None:
+    class OfCard(KnownAnswer):
+        def prepare(self, path: Any, unit: str | None = None, name: str | None = None) -> Part:
+            digest = path.read_text() if path.suffix == ".kmn" else "of the file"
+            return replace(super().prepare(path), source_digest=digest)
+
+    said: list[str] = []
+    for name in ("nut.stl", "bolt.STEP", "lone.stl"):
+        (tmp_path / name).write_bytes(name.encode())
+    (tmp_path / "nut.kmn").write_text(hashlib.sha256(b"nut.stl").hexdigest())
+    (tmp_path / "bolt.kmn").write_text(hashlib.sha256(b"an earlier one").hexdigest())
+    found = _prepared(OfCard(), tmp_path, 3, said.append)
+    assert {name: part.source_digest for name, part in found.items()} == {
+        "bolt": (tmp_path / "bolt.kmn").read_text(),
+        "lone": "of the file",
+        "nut": (tmp_path / "nut.kmn").read_text(),
+    }
+    assert said == ["the part bolt is that of bolt.kmn, which was not made from bolt.STEP as it is now"]
+    (tmp_path / "nut.step").touch()
+    with pytest.raises(InputError, match=r"two files for the part nut, nut\.step and nut\.stl: remove one"):
+        _prepared(OfCard(), tmp_path, 3)
 
 
 def test_connections_are_kept_as_long_as_the_next_head_may_take() -> None:
