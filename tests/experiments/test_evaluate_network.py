@@ -108,7 +108,7 @@ def test_the_card_tells_how_exact_poses_are(run: Path, evaluation: Path, tmp_pat
         *("shifted, mm", "shifted, % of the diameter", "turned, degrees"),
         *("MSSD recall", "average precision"),
     ]
-    assert rows[1][4:] == ["0.221 / 1.51", "0.9 / 3.56", "1.78 / 180", "0.51", "0.42"]
+    assert rows[1][4:] == ["0.00728 / 1.35", "0.0285 / 3.64", "0.0304 / 180", "0.52", "0.40"]
 
 
 def test_a_release_holds_weights_curve_picture_and_card(run: Path, evaluation: Path, tmp_path: Path) -> None:
