@@ -81,3 +81,12 @@ worlds = replace(
     ),
     optimizer=replace(small.optimizer, learning_rate=1e-2),
 )
+
+chiral = replace(
+    worlds,
+    name="chiral",
+    network=replace(small.network, inputs="chiral"),
+    warm_start="experiments/assets/worlds.safetensors",
+    num_steps=11_000,
+    optimizer=replace(worlds.optimizer, learning_rate=2e-2),
+)

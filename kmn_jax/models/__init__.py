@@ -1,7 +1,8 @@
 """The network: published shapes from exact algebra, object and scene features as reusable values."""
 
+from kmn_jax.models._chirality import with_chiral_inputs
 from kmn_jax.models._config import KeyMatchNetConfig
-from kmn_jax.models._invariants import NUM_OBJECT_INVARIANTS, NUM_PAIR_INVARIANTS, NUM_SCENE_INVARIANTS
+from kmn_jax.models._invariants import OBJECT_CHANNELS, PAIR_CHANNELS, SCENE_CHANNELS
 from kmn_jax.models._keymatchnet import (
     KeyMatchNet,
     Model,
@@ -19,10 +20,10 @@ from kmn_jax.models._released import RELEASED_CONFIG, load_released, save_releas
 from kmn_jax.models._weights import is_model_file, load_model, load_pretrained, released_file, save_model
 
 __all__ = [
-    "NUM_OBJECT_INVARIANTS",
-    "NUM_PAIR_INVARIANTS",
-    "NUM_SCENE_INVARIANTS",
+    "OBJECT_CHANNELS",
+    "PAIR_CHANNELS",
     "RELEASED_CONFIG",
+    "SCENE_CHANNELS",
     "Compute",
     "KeyMatchNet",
     "KeyMatchNetConfig",
@@ -46,4 +47,5 @@ __all__ = [
     "released_scene",
     "save_model",
     "save_released",
+    "with_chiral_inputs",
 ]

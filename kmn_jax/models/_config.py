@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from kmn_jax.errors import InputError, require, shown
+from kmn_jax.models._invariants import Inputs
 from kmn_jax.models._layers import Compute
 from kmn_jax.models._pair_head import PairDropout
 
 Graph = Literal["dynamic", "static"]
 Normalization = Literal["metric", "released"]
-Inputs = Literal["raw", "invariant"]
 ObjectBranch = Literal["cad", "learned"]
 
 _CHOICES = {
@@ -32,7 +32,8 @@ class KeyMatchNetConfig:
         num_scene_points, num_object_points, num_keypoints: N, M and K, the sizes that data is made for. The
             network itself takes any.
         normalization: "metric" divides both clouds by one length, "released" is what the authors' weights need.
-        inputs: "raw" coordinates and normals as published, or rotation "invariant" point pair features.
+        inputs: "raw" coordinates and normals as published, rotation "invariant" point pair features, or "chiral"
+            ones, which also tell a shape from its mirror image, in the second block, too.
         graph: "dynamic" finds neighbours anew in feature space, "static" keeps those of the coordinates.
         object_branch: where keypoint features come from: the "cad" cloud, or "learned", for one object that the
             network is trained for, and its K fixed keypoints.
@@ -75,9 +76,9 @@ class KeyMatchNetConfig:
             if name in widths and size % self.groups:
                 raise InputError(f"{name} is {size}, but must be a multiple of groups = {self.groups}")
         require(0 <= self.dropout < 1, f"dropout is {self.dropout}, but must be in [0, 1)")
-        if self.inputs == "invariant" and self.normalization == "released":
+        if self.inputs != "raw" and self.normalization == "released":
             raise InputError(
-                'inputs "invariant" need normalization "metric": "released" scales the axes of space unevenly'
+                f'inputs "{self.inputs}" need normalization "metric": "released" scales the axes of space unevenly'
             )
         if self.object_digest and self.object_branch == "cad":
             raise InputError("object_digest names the object of a network with learned features, which this is not")

@@ -19,8 +19,8 @@ from kmn_jax.geometry import largest_distance
 from kmn_jax.models._config import KeyMatchNetConfig
 from kmn_jax.models._encoder import Encoder
 from kmn_jax.models._invariants import (
-    NUM_OBJECT_INVARIANTS,
-    NUM_SCENE_INVARIANTS,
+    OBJECT_CHANNELS,
+    SCENE_CHANNELS,
     object_invariants,
     raw_inputs,
     scene_invariants,
@@ -68,9 +68,9 @@ class KeyMatchNet(nnx.Module):
 
     def __init__(self, config: KeyMatchNetConfig, *, rngs: nnx.Rngs) -> None:
         self.config = config
-        self.scene = Encoder(config, NUM_SCENE_INVARIANTS, rngs=rngs)
+        self.scene = Encoder(config, SCENE_CHANNELS[config.inputs], rngs=rngs)
         if config.object_branch == "cad":
-            self.object = Encoder(config, NUM_OBJECT_INVARIANTS, rngs=rngs)
+            self.object = Encoder(config, OBJECT_CHANNELS[config.inputs], rngs=rngs)
             self.object_out = NormalizedLinear(config.scene_width, config.object_width, config.groups, rngs=rngs)
         else:
             shape = config.num_keypoints, config.object_width
@@ -119,7 +119,7 @@ class KeyMatchNet(nnx.Module):
         elif config.inputs == "raw":
             inputs = raw_inputs(metric_scene(crop, length))
         else:
-            inputs = scene_invariants(metric_scene(crop, length), mask)
+            inputs = scene_invariants(metric_scene(crop, length), mask, config.inputs == "chiral")
         features = self.scene(inputs, config.compute, mask)
         return features if mask is None else jnp.where(mask[:, None], features, 0)
 

@@ -14,7 +14,7 @@ from jaxtyping import Int32
 
 from kmn_jax.data import DevicePack, Pack, PipelineConfig, SampleBatches, SampleIndex, stack_pack
 from kmn_jax.errors import InputError
-from kmn_jax.models import KeyMatchNetConfig, load_model, load_pretrained
+from kmn_jax.models import KeyMatchNetConfig, load_model, load_pretrained, with_chiral_inputs
 from kmn_jax.train._config import TrainConfig
 from kmn_jax.train._rendered import rendered_frames
 from kmn_jax.train._sharding import put_whole
@@ -87,6 +87,8 @@ def warm_parameters(config: TrainConfig) -> nnx.State | None:
         return None
     known = Path(config.warm_start).suffix == ".safetensors"
     model = load_model(config.warm_start) if known else load_pretrained(config.warm_start)
+    if model.config == replace(config.network, inputs="invariant") and config.network.inputs == "chiral":
+        model = with_chiral_inputs(model)
     if model.config != config.network:
         raise InputError(f"warm_start = {config.warm_start} holds another network than the config's: leave it out")
     return model.parameters

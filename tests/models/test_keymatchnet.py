@@ -74,7 +74,7 @@ def test_forward_is_the_dense_one(seed: int) -> None:
     assert_close(logits(model, crop, cloud), [np.asarray(x) for x in want])
 
 
-@pytest.mark.parametrize("inputs", ["raw", "invariant"])
+@pytest.mark.parametrize("inputs", ["raw", "invariant", "chiral"])
 @pytest.mark.parametrize("real", [200, 30, 5])
 def test_padded_crop_equals_the_unpadded_one(inputs: str, real: int) -> None:
     """5 real points are fewer than the 8 neighbours asked for."""

@@ -13,7 +13,7 @@ from configs import find_config
 from kmn_jax.data import Pack
 from kmn_jax.data._pack import write_manifest, write_object
 from kmn_jax.errors import InputError
-from kmn_jax.models import create_model, save_model
+from kmn_jax.models import create_model, save_model, with_chiral_inputs
 from kmn_jax.train._sources import trained_network, warm_parameters
 
 DEBUG = find_config("debug")
@@ -48,3 +48,7 @@ def test_a_warm_start_begins_with_the_weights_of_a_file(tmp_path: Path) -> None:
         np.testing.assert_array_equal(leaf, wanted)
     with pytest.raises(InputError, match="another network than the config's"):
         warm_parameters(replace(DEBUG, warm_start="small"))
+    chiral = replace(DEBUG, network=replace(DEBUG.network, inputs="chiral"))
+    grown = warm_parameters(replace(chiral, warm_start=str(tmp_path / "some.safetensors")))
+    for leaf, wanted in zip(jax.tree.leaves(grown), jax.tree.leaves(with_chiral_inputs(model)[1]), strict=True):
+        np.testing.assert_array_equal(leaf, wanted)
