@@ -85,8 +85,8 @@ worlds = replace(
 chiral = replace(
     worlds,
     name="chiral",
-    network=replace(small.network, inputs="chiral"),
+    network=replace(small.network, inputs="chiral", num_keypoints=64),
     warm_start="experiments/assets/worlds.safetensors",
-    num_steps=11_000,
+    num_steps=13_000,
     optimizer=replace(worlds.optimizer, learning_rate=2e-2),
 )

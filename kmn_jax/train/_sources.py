@@ -87,11 +87,19 @@ def warm_parameters(config: TrainConfig) -> nnx.State | None:
         return None
     known = Path(config.warm_start).suffix == ".safetensors"
     model = load_model(config.warm_start) if known else load_pretrained(config.warm_start)
-    if model.config == replace(config.network, inputs="invariant") and config.network.inputs == "chiral":
+    if config.network.inputs == "chiral" and model.config.inputs == "invariant":
         model = with_chiral_inputs(model)
-    if model.config != config.network:
+    if replace(model.config, **_sizes_of_data(config.network)) != config.network:
         raise InputError(f"warm_start = {config.warm_start} holds another network than the config's: leave it out")
     return model.parameters
+
+
+def _sizes_of_data(network: KeyMatchNetConfig) -> dict[str, int]:
+    """Return the sizes of a network's data, which its parameters do not depend on."""
+    if network.object_branch == "learned":  # it has parameters for each keypoint
+        return {}
+    names = ("num_scene_points", "num_object_points", "num_keypoints")
+    return {name: getattr(network, name) for name in names}
 
 
 def _packed_source(
