@@ -89,17 +89,21 @@ def warm_parameters(config: TrainConfig) -> nnx.State | None:
     model = load_model(config.warm_start) if known else load_pretrained(config.warm_start)
     if config.network.inputs == "chiral" and model.config.inputs == "invariant":
         model = with_chiral_inputs(model)
-    if replace(model.config, **_sizes_of_data(config.network)) != config.network:
+    if _for_data_of(config.network, model.config) != config.network:
         raise InputError(f"warm_start = {config.warm_start} holds another network than the config's: leave it out")
     return model.parameters
 
 
-def _sizes_of_data(network: KeyMatchNetConfig) -> dict[str, int]:
-    """Return the sizes of a network's data, which its parameters do not depend on."""
-    if network.object_branch == "learned":  # it has parameters for each keypoint
-        return {}
-    names = ("num_scene_points", "num_object_points", "num_keypoints")
-    return {name: getattr(network, name) for name in names}
+def _for_data_of(other: KeyMatchNetConfig, config: KeyMatchNetConfig) -> KeyMatchNetConfig:
+    """Return a network's config with another's sizes of data, as far as its parameters do not depend on them."""
+    if config.object_branch == "learned":  # it has parameters for each keypoint
+        return config
+    return replace(
+        config,
+        num_scene_points=other.num_scene_points,
+        num_object_points=other.num_object_points,
+        num_keypoints=other.num_keypoints,
+    )
 
 
 def _packed_source(
