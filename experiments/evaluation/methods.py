@@ -30,8 +30,11 @@ from kmn_jax.models import Model, model_structure
 from kmn_jax.objects import ObjectModel, Part, PartArrays, arrays_of, make_part, model_digest
 from kmn_jax.pose import Matches, RansacConfig
 
-# The published scheme after the same smoothing: one draw of points, one search, and its best pose is taken.
-ONE_RANSAC = CropSearchConfig(num_draws=1, num_modes=1, num_poses=1, ransac=RansacConfig(), icp=None)
+# The published scheme after the same smoothing: one draw of points, one search, and its best pose is taken. The gate of
+# normals, published as 30 degrees, is wider, as a keypoint near an edge is also that of points on the next face.
+ONE_RANSAC = CropSearchConfig(
+    num_draws=1, num_modes=1, num_poses=1, ransac=RansacConfig(normal_gate_degrees=60.0), icp=None
+)
 
 
 @dataclass(frozen=True)

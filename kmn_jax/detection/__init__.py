@@ -44,7 +44,6 @@ from kmn_jax.detection._detect import (
     detect,
     detections,
     explore,
-    polished_candidates,
     refined_candidates,
 )
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place, symmetry_transforms
@@ -153,7 +152,6 @@ __all__ = [
     "network_prediction",
     "picture_agreement",
     "placed",
-    "polished_candidates",
     "pose_notes",
     "poses_at",
     "poses_in_crop",

@@ -66,7 +66,9 @@ class CropSearchConfig:
     crop_points: int = 4096  # of the crop at least, from which normals are estimated
     smooth: SmoothConfig | None = field(default_factory=SmoothConfig)
     matches: MatchConfig = field(default_factory=lambda: MatchConfig(capacity=1024))
-    ransac: RansacConfig = field(default_factory=lambda: RansacConfig(num_hypotheses=500, num_candidates=8192))
+    ransac: RansacConfig = field(
+        default_factory=lambda: RansacConfig(num_hypotheses=500, num_candidates=8192, normal_gate_degrees=60.0)
+    )
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     surface_points: int = 128  # on the object
     icp: IcpConfig | None = field(default_factory=lambda: IcpConfig(iterations=8))  # None: poses stay as found

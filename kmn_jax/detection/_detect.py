@@ -123,8 +123,6 @@ def detect(
                 found = refined_candidates(on_device, scene, found, rows, random_seed, search)
             with clock("selection"):
                 choice = chosen(found, calibration, on_device, config)
-            with clock("refinement"):
-                found = polished_candidates(on_device, scene, found, np.flatnonzero(choice.kept))
     with clock("report"):
         poses = detections(found, choice, calibration, part, scene)
         accepted = choice.kept & (calibration.probability(found.evidence) >= config.accepted)
@@ -191,7 +189,8 @@ def refined_candidates(
 ) -> Candidates:
     """Return some of the candidates refined on all points around them, and turned forms of them that fit as well.
 
-    The first k are the candidates themselves; all have evidence of their own.
+    The first k are the candidates themselves. All are polished, so that what is compared are the best poses of each
+    form, and have evidence of their own.
     """
     given = (on_device, scene.cloud, scene.image, config.crops.smooth, config.agreement)
     seeds = found.seed_rows[found.crop[rows]]
@@ -201,6 +200,12 @@ def refined_candidates(
         found.T_camera_object[rows],
         seeds.astype(np.int32),
         seed_keys(seeds, random_seed),
+    )
+    poses = np.array(poses)
+    poses[there] = call_rows(
+        lambda pose: polish_one(pose, on_device, scene.image),
+        lambda poses: polish_many(poses, on_device, scene.image),
+        poses[there],
     )
     # The refined forms take the place of the poses of their crops.
     forms = there.shape[1]
@@ -226,21 +231,6 @@ def refined_candidates(
         found.found,
         found.seed_rows,
     )
-
-
-def polished_candidates(
-    on_device: DevicePart, scene: Scene, found: Candidates, rows: Int[np.ndarray, " k"]
-) -> Candidates:
-    """Return the candidates with some of their poses polished: their evidence is that of before."""
-    if not len(rows):
-        return found
-    poses = found.T_camera_object.copy()
-    poses[rows] = call_rows(
-        lambda pose: polish_one(pose, on_device, scene.image),
-        lambda poses: polish_many(poses, on_device, scene.image),
-        poses[rows],
-    )
-    return found._replace(T_camera_object=poses)
 
 
 def _forms_first(leaf: Any) -> np.ndarray:
