@@ -9,7 +9,7 @@ from configs.debug import debug
 from configs.normalization import normalization_metric, normalization_released
 from configs.paper import paper, paper_tenth
 from configs.per_object import per_object
-from configs.small import chiral, small, worlds
+from configs.small import small, worlds
 from kmn_jax.errors import InputError
 from kmn_jax.train._config import TrainConfig
 
@@ -21,7 +21,6 @@ CONFIGS: dict[str, TrainConfig] = {
         base,
         small,
         worlds,
-        chiral,
         per_object,
         normalization_metric,
         normalization_released,

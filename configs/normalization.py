@@ -24,7 +24,7 @@ normalization_metric, normalization_released = (
         name=f"normalization_{normalization}",
         pack="outputs/packs/electronics_120",
         num_steps=2_000,
-        network=replace(small.network, inputs="raw", normalization=normalization),
+        network=replace(small.network, num_keypoints=20, inputs="raw", normalization=normalization),
     )
     for normalization in ("metric", "released")
 )

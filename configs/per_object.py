@@ -1,4 +1,4 @@
-"""A network for one part: the trunk of `small` without the object branch, with features of its K keypoints learned.
+"""A network for one part: no object branch, but learned features of its K keypoints, and else `small` as it first was.
 
 What the published comparison's networks trained for each object stand for: it shows what zero-shot costs.
 
@@ -24,7 +24,7 @@ per_object = replace(
     name="per_object",
     pack="outputs/packs/per_object",
     num_steps=4_000,
-    network=replace(small.network, object_branch="learned"),
+    network=replace(small.network, num_keypoints=20, inputs="invariant", object_branch="learned"),
     examples=replace(small.examples, rotate_object=False, object_shift=0.0, object_noise=0.0),
     pipeline=replace(small.pipeline, samples_per_object=640),
     validate_every=500,
