@@ -28,12 +28,14 @@ def _ransac(**changed: Any) -> CropSearchConfig:
     return replace(_PLAIN, ransac=replace(_PLAIN.ransac, **changed))
 
 
-KEYPOINTS = {"10 keypoints": 10, "40 keypoints": 40}
+KEYPOINTS = {"20 keypoints": 20, "40 keypoints": 40, "128 keypoints": 128}
 VARIANTS = {
     "vote threshold 0.5": _matches(vote_threshold=0.5),
     "vote threshold 0.9": _matches(vote_threshold=0.9),
     "softmax over points": _matches(softmax="points"),
     "no normal check": _ransac(use_normals=False),
+    "normals within 30 degrees": _ransac(normal_gate_degrees=30.0),
+    "normals within 45 degrees": _ransac(normal_gate_degrees=45.0),
     "100 hypotheses": _ransac(num_hypotheses=100),
     "2000 hypotheses": _ransac(num_hypotheses=2000),
     "gate 0.1": _ransac(distance_gate=0.1),
