@@ -13,7 +13,7 @@ from typing import Any
 
 from experiments.evaluate import Options, compare, released_or_own, run
 from experiments.evaluation.cases import Method
-from experiments.evaluation.methods import Ours
+from experiments.evaluation.methods import ONE_RANSAC, Ours
 from kmn_jax.detection import CropSearchConfig
 from kmn_jax.models import Model
 
@@ -52,11 +52,27 @@ VARIANTS = {
 }
 
 
+# One pose of one RANSAC, as published, which had 20 keypoints and normals within 30 degrees.
+_PUBLISHED_GATE = replace(ONE_RANSAC, ransac=replace(ONE_RANSAC.ransac, normal_gate_degrees=30.0))
+SINGLE = {
+    "one RANSAC": (ONE_RANSAC, None),
+    "one RANSAC, 20 keypoints": (ONE_RANSAC, 20),
+    "one RANSAC, normals within 30 degrees": (_PUBLISHED_GATE, None),
+    "one RANSAC, 20 keypoints, normals within 30 degrees": (_PUBLISHED_GATE, 20),
+    "one RANSAC, 1024 points": (replace(ONE_RANSAC, num_points=1024), None),
+    "one RANSAC, vote threshold 0.5": (
+        replace(ONE_RANSAC, matches=replace(ONE_RANSAC.matches, vote_threshold=0.5)),
+        None,
+    ),
+}
+
+
 def methods_of(model: Model) -> dict[str, Method]:
-    """Return our pipeline as it is, and with one choice changed each."""
+    """Return our pipeline as it is, with one choice changed each, and what it is built on, the published search."""
     fewer = {name: Ours(name, model, num_keypoints=count) for name, count in KEYPOINTS.items()}
     other = {name: Ours(name, model, config) for name, config in VARIANTS.items()}
-    changed = {name.replace(" ", "_"): method for name, method in (fewer | other).items()}
+    single = {name: Ours(name, model, config, num_keypoints=count) for name, (config, count) in SINGLE.items()}
+    changed = {name.replace(",", "").replace(" ", "_"): method for name, method in (fewer | other | single).items()}
     return {"ours": Ours("kmn_jax", model), **changed}
 
 

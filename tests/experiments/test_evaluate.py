@@ -206,9 +206,13 @@ def test_clouds_with_poses_are_evaluated_from_their_sensor(tmp_path: Path, gear:
 def test_an_ablation_changes_one_choice_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     methods = ablate.methods_of(load_model(released_file("small")))
     plain = leaves(methods["ours"].settings)
+    single = leaves(methods["one_RANSAC"].settings)
     for key, method in methods.items():
-        assert len(plain.items() ^ leaves(method.settings).items()) == (0 if key == "ours" else 2), key
+        base = single if key.startswith("one_RANSAC") else plain
+        number = 0 if key in ("ours", "one_RANSAC") else 2 * (1 + key.count("keypoints_normals"))
+        assert len(base.items() ^ leaves(method.settings).items()) == number, key
     monkeypatch.setattr(ablate, "VARIANTS", {})
+    monkeypatch.setattr(ablate, "SINGLE", {})
     monkeypatch.setattr(ablate, "KEYPOINTS", {"10 keypoints": 10})
     monkeypatch.setattr(evaluate, "_TOGETHER", 1)  # of two
     options = ["demo", "--objects", GEAR, "--images", "1", "--crops", "3", "--output", str(tmp_path / "out")]
