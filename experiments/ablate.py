@@ -40,7 +40,7 @@ VARIANTS = {
     "2000 hypotheses": _ransac(num_hypotheses=2000),
     "gate 0.1": _ransac(distance_gate=0.1),
     "256 points": replace(_PLAIN, num_points=256),
-    "1024 points": replace(_PLAIN, num_points=1024),
+    "512 points": replace(_PLAIN, num_points=512),
     "one draw": replace(_PLAIN, num_draws=1),
     "two draws": replace(_PLAIN, num_draws=2),
     "four draws in any case": replace(_PLAIN, enough=None),
@@ -59,7 +59,7 @@ SINGLE = {
     "one RANSAC, 20 keypoints": (ONE_RANSAC, 20),
     "one RANSAC, normals within 30 degrees": (_PUBLISHED_GATE, None),
     "one RANSAC, 20 keypoints, normals within 30 degrees": (_PUBLISHED_GATE, 20),
-    "one RANSAC, 1024 points": (replace(ONE_RANSAC, num_points=1024), None),
+    "one RANSAC, 512 points": (replace(ONE_RANSAC, num_points=512), None),
     "one RANSAC, vote threshold 0.5": (
         replace(ONE_RANSAC, matches=replace(ONE_RANSAC.matches, vote_threshold=0.5)),
         None,

@@ -47,6 +47,7 @@ from kmn_jax.typing import PRNGKey, Scalar
 
 _NORMAL_RADIUS = 0.06  # diameters, of normals without smoothing
 _LEAST_POINTS = 16  # a crop of fewer is not valid
+_LEAST_DRAWN = 1024  # points of a draw
 _COMPARED = 32  # points of the surface by which poses are told apart
 
 _Draws = TypeVar("_Draws")
@@ -62,7 +63,7 @@ class CropSearchConfig:
     num_modes: int = 4  # poses of each draw that are compared with the surface
     num_poses: int = 3  # that are refined and returned: the best ones that differ
     distinct: float = 0.1  # how far apart, somewhere on the surface, poses differ
-    num_points: int | None = None  # of a draw; unless given, as many as the network was made for: see `of_network`
+    num_points: int | None = None  # of a draw; unless given, by the network: see `of_network`
     crop_points: int = 4096  # of the crop at least, from which normals are estimated
     smooth: SmoothConfig | None = field(default_factory=SmoothConfig)
     matches: MatchConfig = field(default_factory=lambda: MatchConfig(capacity=1024))
@@ -82,8 +83,11 @@ class CropSearchConfig:
             raise InputError(f"enough = {self.enough} must be finite; None makes all draws")
 
     def of_network(self, config: KeyMatchNetConfig) -> CropSearchConfig:
-        """Return the same with the number of points of a draw that a network was made for, unless it is given."""
-        return replace(self, num_points=self.num_points or config.num_scene_points)
+        """Return the same with the number of points of a draw, unless it is given.
+
+        It is that which the network was trained with, or more: one of 512 finds more in 1,024 (experiments/RESULTS.md).
+        """
+        return replace(self, num_points=self.num_points or max(config.num_scene_points, _LEAST_DRAWN))
 
     @property
     def points_of_draw(self) -> int:
