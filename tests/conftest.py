@@ -59,6 +59,15 @@ def few_optimisations() -> Iterator[None]:
     jax.clear_caches()  # that are not asked how a program was compiled: other files would run the slow ones for minutes
 
 
+@pytest.fixture
+def all_optimisations(few_optimisations: None) -> Iterator[None]:
+    """Compile as users do, in a file that else does not: without, one value may be rounded otherwise for each use."""
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", True)
+    jax.clear_caches()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: place(item.path))
     has_torch = importlib.util.find_spec("torch") is not None

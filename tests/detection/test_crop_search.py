@@ -145,10 +145,8 @@ def test_one_draw_and_one_pose_are_the_published_search(model: Model, part: Part
 
 def test_poses_differ_the_best_first_and_are_refined(model: Model, part: PartArrays, cases: list[Case]) -> None:
     rough, fine = (
-        jax.device_get(
-            poses_at(model, part, padded(cases[0].points), 0, 0, replace(CONFIG, icp=IcpConfig(iterations=rounds)))
-        )
-        for rounds in (1, 8)
+        jax.device_get(poses_at(model, part, padded(cases[0].points), 0, 0, replace(CONFIG, icp=icp)))
+        for icp in (None, IcpConfig(iterations=8))
     )
     there = rough.poses.converged
     assert there[0]
@@ -157,7 +155,7 @@ def test_poses_differ_the_best_first_and_are_refined(model: Model, part: PartArr
     placed = [surface @ pose[:3, :3].T + pose[:3, 3] for pose in rough.poses.T_scene_object[there]]
     for row, one in enumerate(placed):
         for other in placed[:row]:
-            assert np.linalg.norm(one - other, axis=1).max() > 0.9 * CONFIG.distinct * float(part.diameter)
+            assert np.linalg.norm(one - other, axis=1).max() > CONFIG.distinct * float(part.diameter)
     np.testing.assert_array_equal(fine.scores, rough.scores)
     moved = np.abs(fine.poses.T_scene_object - rough.poses.T_scene_object)[there].max(axis=(1, 2))
     assert moved[0] > 0  # a lesser pose may have nothing near it that ICP could pair
@@ -181,6 +179,7 @@ def test_no_more_draws_are_made_than_it_takes(model: Model, part: PartArrays, ca
         np.testing.assert_array_equal(leaf[1:], np.zeros_like(leaf[1:]))
 
 
+@pytest.mark.usefixtures("all_optimisations")
 def test_draws_side_by_side_are_those_made_in_turn(model: Model, part: PartArrays, cases: list[Case]) -> None:
     config, key = replace(CONFIG, num_draws=3, enough=9.0), jax.random.key(0)
     network = nnx.merge(model.graphdef, model.parameters)
@@ -189,17 +188,13 @@ def test_draws_side_by_side_are_those_made_in_turn(model: Model, part: PartArray
     in_turn, at_once = (search(network, part, crop, key, replace(config, side_by_side=given)) for given in (None, True))
     assert at_once.num_draws == in_turn.num_draws == 3
     np.testing.assert_array_equal(at_once.poses.converged, in_turn.poses.converged)
-    # Programs that differ round differently. A neighbour that is as near as another one changes some logits a little,
-    # and a match at the gate, which counts in one of them, moves a pose a little.
-    difference = np.abs(at_once.predictions.logits - in_turn.predictions.logits)
-    assert np.mean(difference < 1e-3) > 0.98
-    assert difference.max() < 0.05
+    # Programs that differ round differently.
+    np.testing.assert_allclose(at_once.predictions.logits, in_turn.predictions.logits, atol=1e-3)
     apart = jax.vmap(jax.vmap(adi, in_axes=(0, 0, None)), in_axes=(0, 0, None))(
         at_once.poses.T_scene_object, in_turn.poses.T_scene_object, part.points[:256]
     )
-    assert apart.max() < 0.01 * part.diameter
-    assert jnp.median(apart) < 1e-4 * part.diameter
-    np.testing.assert_allclose(at_once.scores, in_turn.scores, atol=0.02)
+    assert apart.max() < 1e-4 * part.diameter
+    np.testing.assert_allclose(at_once.scores, in_turn.scores, atol=1e-3)
 
 
 @pytest.mark.parametrize(
