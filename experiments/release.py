@@ -148,6 +148,13 @@ def _picture(rows: list[dict[str, Any]], path: Path) -> None:
     write_whole(path, as_png(canvas))
 
 
+def _begun(warm_start: str | None) -> str:
+    """Return a sentence on the weights that a run began with, if it had some."""
+    if warm_start is None:
+        return ""
+    return f"They went on from the weights `{warm_start}`, whose samples are not among these (configs/small.py). "
+
+
 def _card(
     name: str,
     config: dict[str, Any],
@@ -174,8 +181,8 @@ def _card(
         "Data": f"pack `{Path(config['pack']).name}`: {sessions[-1]['training_objects']} training and"
         f" {sessions[-1]['validation_objects']} validation objects, scenes of docs/data.md, made during training",
         "Samples": f"{best['samples']:,} seen by these weights (step {best['step']:,}; the run has validated up to step"
-        f" {last['step']:,} of {config['num_steps']:,}). The published network saw {_PUBLISHED_SAMPLES:,}:"
-        f" {_PUBLISHED_SAMPLES / best['samples']:.0f} times as many",
+        f" {last['step']:,} of {config['num_steps']:,}). {_begun(config.get('warm_start'))}The published network saw"
+        f" {_PUBLISHED_SAMPLES:,}",
         "Optimizer": f"{config['optimizer']['method']}, rate {config['optimizer']['learning_rate']},"
         f" {config['optimizer']['schedule']} schedule, batch {config['pipeline']['batch_size']}, mean of parameters"
         f" with decay {config['average_decay']}",
