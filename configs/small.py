@@ -13,8 +13,8 @@ worlds
     Hardware:  2 CPU cores: 15 minutes for the pack; 55 to 60 samples/s, half as many beside other work.
     Expected:  after 168,000 samples, 0.9 h beside other work: validation loss 2.149, segmentation accuracy 0.956,
                keypoint accuracy 0.152 of 64. These are the released weights, to go on from without --warm-start. FILE
-               were those of 160,000 samples in worlds of components, with invariant inputs and 20 keypoints (loss 1.627,
-               keypoint accuracy 0.231; `experiments/assets/worlds.safetensors` at commit a4dca0e, where the run was
+               were those of 160,000 samples in worlds of components, with invariant inputs and 20 keypoints (1.627 and
+               0.231 of 20; `experiments/assets/worlds.safetensors` at commit a4dca0e, where the run was
                called `chiral`), which had begun with the 560,000 above.
 """
 
