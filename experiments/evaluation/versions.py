@@ -22,7 +22,7 @@ VERSIONS = {
     "cases": 1,  # what is read of a scan, and which crops of it are drawn: cases, sources, clouds
     "refinement": 2,  # the ICP that follows every method
     # Of methods, by their classes: raising one makes the poses of that method stale, and no others.
-    "Ours": 2,  # encoding of an object, network, matches and the search of a crop; also with an object's own network
+    "Ours": 3,  # encoding of an object, network, matches and the search of a crop; also with an object's own network
     "OverMatches": 1,  # another search over our matches, beside "Ours"
     "Fpfh": 1,
     "FastGlobal": 1,

@@ -244,7 +244,7 @@ def test_what_cannot_be_is_one_sentence(
     with pytest.raises(InputError, match="no object is given"):
         estimator.scene(scan, [])
     save_part(replace(motor, features=motor.features[:4]), tmp_path / "few.kmn")
-    with pytest.raises(InputError, match=r"few\.kmn has 4 keypoints, not 20"):
+    with pytest.raises(InputError, match=r"few\.kmn has 4 keypoints, not 64"):
         estimator.prepare(tmp_path / "few.kmn")
     save_part(motor, tmp_path / "motor.kmn")
     assert estimator.prepare(tmp_path / "motor.kmn", "mm").unit == "mm"

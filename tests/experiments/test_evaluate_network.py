@@ -89,7 +89,7 @@ def test_the_released_model_does_what_its_card_says(tmp_path: Path) -> None:
     assert results["sha256"][:16] in card
     assert load_pretrained("small").config.num_keypoints == 64  # of which the table has 20, as published
     # Two objects of a few images: less exact than the card's seven, and better than chance by far.
-    found, _ = results["splits"]
+    found, *_ = results["splits"]
     assert found["segmentation"] > 0.93
     assert found["keypoints"] > 5 / 64
 
