@@ -11,7 +11,13 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from benchmarks.timing import Ceilings
-from kmn_jax.models import OBJECT_CHANNELS, PAIR_CHANNELS, SCENE_CHANNELS, KeyMatchNetConfig
+from kmn_jax.models import (
+    LATER_PAIR_CHANNELS,
+    OBJECT_CHANNELS,
+    PAIR_CHANNELS,
+    SCENE_CHANNELS,
+    KeyMatchNetConfig,
+)
 from kmn_jax.pose import IcpConfig, MatchConfig, RansacConfig
 
 _FLOAT = 4
@@ -90,14 +96,13 @@ def pair_head(points: int, keypoints: int, scene: int, part: int, width: int) ->
 def scene_stages(config: KeyMatchNetConfig, points: int) -> dict[str, Work]:
     """The scene branch and the pair head of a network, in order."""
     inputs, pairs = SCENE_CHANNELS[config.inputs], PAIR_CHANNELS[config.inputs]
-    later_pairs = pairs if config.inputs == "chiral" else 0
     count, width = min(config.num_neighbors, points), config.edge_width
     stages = {
         "order of the points": order_of(points, inputs),
         "kNN on coordinates": neighbors(points, 3, count),
         "EdgeConv 1": edge_conv(points, count, inputs, width, 2, pairs),
         "kNN on features, first": neighbors(points, width, count),
-        "EdgeConv 2": edge_conv(points, count, width, width, 2, later_pairs),
+        "EdgeConv 2": edge_conv(points, count, width, width, 2, LATER_PAIR_CHANNELS[config.inputs]),
         "kNN on features, second": neighbors(points, width, count),
         "EdgeConv 3": edge_conv(points, count, width, width, 1),
         "global and output layers": global_layers(points, 3 * width, config.embedding_width, config.scene_width),
@@ -113,12 +118,15 @@ def object_work(config: KeyMatchNetConfig) -> Work:
     """The object branch: all points in its first block, the neighbours of the keypoints in its second."""
     points, keypoints, width = config.num_object_points, config.num_keypoints, config.edge_width
     inputs, pairs = OBJECT_CHANNELS[config.inputs], PAIR_CHANNELS[config.inputs]
-    later_pairs = pairs if config.inputs == "chiral" else 0
     count = min(config.num_neighbors, points)
     work = order_of(points, inputs) + neighbors(points, 3, count) + edge_conv(points, count, inputs, width, 2, pairs)
     if config.graph == "dynamic":
         work = work + neighbors(points, width, count, keypoints)
-    work = work + edge_conv(keypoints, count, width, width, 2, later_pairs) + edge_conv(keypoints, 1, width, width, 1)
+    work = (
+        work
+        + edge_conv(keypoints, count, width, width, 2, LATER_PAIR_CHANNELS[config.inputs])
+        + edge_conv(keypoints, 1, width, width, 1)
+    )
     return work + global_layers(keypoints, 3 * width, config.embedding_width, config.object_width)
 
 

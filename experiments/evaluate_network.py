@@ -12,7 +12,6 @@ import hashlib
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from copy import copy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ from kmn_jax.bop import NAMES_FILE
 from kmn_jax.data import CropConfig, DevicePack, Pack, PipelineConfig, SampleBatches, stack_pack
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import SmoothConfig
-from kmn_jax.models import LossConfig, Model, load_model, model_structure
+from kmn_jax.models import LossConfig, Model, load_model
 from kmn_jax.report import check_target, print_table, write_json
 from kmn_jax.train import (
     ExampleConfig,
@@ -78,13 +77,6 @@ class Evaluator:
         self._graphdef, self._at_once = model.graphdef, crops_at_once
         self._mesh = data_mesh(jax.devices()[:1])
         self._parameters = put_whole(model.parameters, self._mesh)
-
-    def of(self, num_keypoints: int) -> Evaluator:
-        """Return the same for another number of keypoints."""
-        other = copy(self)
-        other.network = replace(self.network, num_keypoints=num_keypoints)
-        other._graphdef = model_structure(other.network).graphdef
-        return other
 
     def rows(self, pack: DevicePack, names: Sequence[str], batches: Iterator[Samples]) -> dict[str, Sums]:
         """Return the sums of each object. Every batch holds crops of one of them."""
@@ -149,7 +141,8 @@ def evaluate(options: Options) -> dict[str, Any]:
     if _digest(path) != digest:
         raise InputError(f"{path} changed while it was read: evaluate it again")
     crops, loss = _settings(path.parent / "config.json", model)
-    evaluator = Evaluator(model, crops, loss, 1 if jax.default_backend() == "cpu" else None)
+    at_once = 1 if jax.default_backend() == "cpu" else None
+    evaluator, published = (Evaluator(one, crops, loss, at_once) for one in (model, _of_published_keypoints(model)))
     splits: list[dict[str, Any]] = []
     details: dict[str, list[dict[str, Any]]] = {}
     if not options.pack.exists() and not options.test_sets:
@@ -163,7 +156,7 @@ def evaluate(options: Options) -> dict[str, Any]:
                 row(f"{split}, {options.pack.name}, training renderer", total_sums(list(found.values())), len(found))
             )
     for folder in options.test_sets:
-        for title, by, with_bin in _settings_of(evaluator):
+        for title, by, with_bin in _kinds_of_crops(evaluator, published):
             found = test_rows(by, folder, options.crops_a_frame, with_bin)
             splits.append(row(f"test, {folder.name}, {title}", total_sums(list(found.values())), len(found)))
             details.setdefault(folder.name, [row(name, sums) for name, sums in found.items()])
@@ -180,16 +173,20 @@ def evaluate(options: Options) -> dict[str, Any]:
     }
 
 
-def _settings_of(evaluator: Evaluator) -> Iterator[tuple[str, Evaluator, bool]]:
+def _of_published_keypoints(model: Model) -> Model:
+    """Return a network for as many keypoints as published, if it was made for more and has no parameters for each."""
+    config = model.config
+    if config.num_keypoints <= _PUBLISHED_KEYPOINTS or config.object_branch == "learned":
+        return model
+    return model.under(replace(config, num_keypoints=_PUBLISHED_KEYPOINTS))
+
+
+def _kinds_of_crops(evaluator: Evaluator, published: Evaluator) -> Iterator[tuple[str, Evaluator, bool]]:
     """Yield how test crops are made: a title, the network, and whether they have points that are on no part."""
     yield "ray casting", evaluator, True
     yield "ray casting, without the bin", evaluator, False
-    if evaluator.network.num_keypoints > _PUBLISHED_KEYPOINTS and evaluator.network.object_branch == "cad":
-        yield (
-            f"ray casting, without the bin, {_PUBLISHED_KEYPOINTS} keypoints",
-            evaluator.of(_PUBLISHED_KEYPOINTS),
-            False,
-        )
+    if published.network != evaluator.network:
+        yield f"ray casting, without the bin, {published.network.num_keypoints} keypoints", published, False
 
 
 def _digest(path: Path) -> str:

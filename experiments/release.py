@@ -148,11 +148,12 @@ def _picture(rows: list[dict[str, Any]], path: Path) -> None:
     write_whole(path, as_png(canvas))
 
 
-def _begun(warm_start: str | None) -> str:
-    """Return a sentence on the weights that a run began with, if it had some."""
+def _beside_published(samples: int, warm_start: str | None) -> str:
+    """Return how many samples the published network saw, as a ratio unless a run began with weights of another."""
+    published = f"The published network saw {_PUBLISHED_SAMPLES:,}"
     if warm_start is None:
-        return ""
-    return f"They went on from the weights `{warm_start}`, whose samples are not among these (configs/small.py). "
+        return f"{published}: {_PUBLISHED_SAMPLES / samples:.0f} times as many"
+    return f"They went on from the weights `{warm_start}`, whose samples are not among these. {published}"
 
 
 def _card(
@@ -168,6 +169,7 @@ def _card(
     best = min(validated, key=lambda row: float(row["loss"]))
     last, network = validated[-1], config["network"]
     devices = sorted({f"{len(each['devices'])} x {each['devices'][0]} ({_processor(each)})" for each in sessions})
+    beside = _beside_published(best["samples"], config.get("warm_start"))
     commits = dict.fromkeys(str(each.get("commit") or "not recorded") for each in sessions)
     here = f"{Path.cwd()}/"  # paths of this machine are of use to nobody
     commands = dict.fromkeys(
@@ -181,8 +183,7 @@ def _card(
         "Data": f"pack `{Path(config['pack']).name}`: {sessions[-1]['training_objects']} training and"
         f" {sessions[-1]['validation_objects']} validation objects, scenes of docs/data.md, made during training",
         "Samples": f"{best['samples']:,} seen by these weights (step {best['step']:,}; the run has validated up to step"
-        f" {last['step']:,} of {config['num_steps']:,}). {_begun(config.get('warm_start'))}The published network saw"
-        f" {_PUBLISHED_SAMPLES:,}",
+        f" {last['step']:,} of {config['num_steps']:,}). {beside}",
         "Optimizer": f"{config['optimizer']['method']}, rate {config['optimizer']['learning_rate']},"
         f" {config['optimizer']['schedule']} schedule, batch {config['pipeline']['batch_size']}, mean of parameters"
         f" with decay {config['average_decay']}",

@@ -52,20 +52,21 @@ def forget_what_was_compiled() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def few_optimisations() -> Iterator[None]:
     """Compile in half of the time what runs for moments only: programs are slower, and round otherwise."""
-    before = jax.config.values["jax_disable_most_optimizations"]
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
-    jax.clear_caches()  # that are not asked how a program was compiled: other files would run the slow ones for minutes
+    yield from _compiling_with(few=True)
 
 
 @pytest.fixture
 def all_optimisations(few_optimisations: None) -> Iterator[None]:
     """Compile as users do, in a file that else does not: without, one value may be rounded otherwise for each use."""
-    jax.config.update("jax_disable_most_optimizations", False)
+    yield from _compiling_with(few=False)
+
+
+def _compiling_with(few: bool) -> Iterator[None]:
+    before = jax.config.values["jax_disable_most_optimizations"]
+    jax.config.update("jax_disable_most_optimizations", few)
     yield
-    jax.config.update("jax_disable_most_optimizations", True)
-    jax.clear_caches()
+    jax.config.update("jax_disable_most_optimizations", before)
+    jax.clear_caches()  # that are not asked how a program was compiled: other files would run the slow ones for minutes
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

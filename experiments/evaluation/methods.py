@@ -26,14 +26,15 @@ from kmn_jax.detection import (
 )
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import Crop
-from kmn_jax.models import Model, model_structure
+from kmn_jax.models import Model
 from kmn_jax.objects import ObjectModel, Part, PartArrays, arrays_of, make_part, model_digest
 from kmn_jax.pose import Matches, RansacConfig
 
 # The published scheme after the same smoothing: one draw of points, one search, and its best pose is taken. The gate of
 # normals, published as 30 degrees, is wider, as a keypoint near an edge is also that of points on the next face.
+_GATE = CropSearchConfig().ransac.normal_gate_degrees
 ONE_RANSAC = CropSearchConfig(
-    num_draws=1, num_modes=1, num_poses=1, ransac=RansacConfig(normal_gate_degrees=60.0), icp=None
+    num_draws=1, num_modes=1, num_poses=1, ransac=RansacConfig(normal_gate_degrees=_GATE), icp=None
 )
 
 
@@ -79,8 +80,7 @@ class Ours:
         """Return an encoded object."""
         config = self.model.config
         count = self.num_keypoints or config.num_keypoints
-        structure = model_structure(replace(config, num_keypoints=count))
-        return make_part(model, Model(structure.graphdef, self.model.parameters))
+        return make_part(model, self.model.under(replace(config, num_keypoints=count)))
 
     def predict(self, part: Part, case: Case) -> CropPrediction:
         """Return what the network says of the first draw of a crop."""

@@ -1,4 +1,4 @@
-"""The last step of a pose that is reported: all that the depth image says of the surface that the sensor sees.
+"""The last step of a refined pose: all that the depth image says of the surface that the sensor sees.
 
 Searches and refinements use few points, whose normals are estimated from noisy neighbours. Here every visible point of
 the part is compared with what was measured in its direction, along the part's own normal, which is exact.

@@ -2,7 +2,7 @@
 
 from kmn_jax.models._chirality import with_chiral_inputs
 from kmn_jax.models._config import KeyMatchNetConfig
-from kmn_jax.models._invariants import OBJECT_CHANNELS, PAIR_CHANNELS, SCENE_CHANNELS
+from kmn_jax.models._invariants import LATER_PAIR_CHANNELS, OBJECT_CHANNELS, PAIR_CHANNELS, SCENE_CHANNELS
 from kmn_jax.models._keymatchnet import (
     KeyMatchNet,
     Model,
@@ -20,6 +20,7 @@ from kmn_jax.models._released import RELEASED_CONFIG, load_released, save_releas
 from kmn_jax.models._weights import is_model_file, load_model, load_pretrained, released_file, save_model
 
 __all__ = [
+    "LATER_PAIR_CHANNELS",
     "OBJECT_CHANNELS",
     "PAIR_CHANNELS",
     "RELEASED_CONFIG",

@@ -10,7 +10,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from kmn_jax.errors import InputError
-from kmn_jax.models._invariants import OBJECT_CHANNELS, PAIR_CHANNELS, SCENE_CHANNELS
+from kmn_jax.models._invariants import LATER_PAIR_CHANNELS, OBJECT_CHANNELS, PAIR_CHANNELS, SCENE_CHANNELS
 from kmn_jax.models._keymatchnet import Model, model_structure
 
 
@@ -32,7 +32,7 @@ def with_chiral_inputs(model: Model) -> Model:
         first, second = (parameters[branch][edge]["first"] for edge in ("edge1", "edge2"))
         points, more = channels["invariant"], channels["chiral"] - channels["invariant"]
         first["kernel"] = _with_rows(first["kernel"], {points: more, 2 * points: more, len(first["kernel"]): added})
-        second["kernel"] = _with_rows(second["kernel"], {len(second["kernel"]): PAIR_CHANNELS["chiral"]})
+        second["kernel"] = _with_rows(second["kernel"], {len(second["kernel"]): LATER_PAIR_CHANNELS["chiral"]})
     state = grown.parameters
     nnx.replace_by_pure_dict(state, parameters)
     return Model(grown.graphdef, state)

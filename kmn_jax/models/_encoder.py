@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from kmn_jax.geometry import k_nearest, neighbor_graph, space_filling_order
 from kmn_jax.models._config import KeyMatchNetConfig
 from kmn_jax.models._edgeconv import EdgeConv
-from kmn_jax.models._invariants import PAIR_CHANNELS, EncoderInputs
+from kmn_jax.models._invariants import LATER_PAIR_CHANNELS, PAIR_CHANNELS, EncoderInputs
 from kmn_jax.models._layers import Compute, NormalizedLinear, channel_moments, product
 
 
@@ -24,15 +24,15 @@ class Encoder(nnx.Module):
     def __init__(self, config: KeyMatchNetConfig, channels: int, *, rngs: nnx.Rngs) -> None:
         """Take points of so many `channels`, and features of their pairs as the config says."""
         width, groups = config.edge_width, config.groups
-        pairs = PAIR_CHANNELS[config.inputs]
-        self.chiral = config.inputs == "chiral"
+        pairs, later_pairs = PAIR_CHANNELS[config.inputs], LATER_PAIR_CHANNELS[config.inputs]
         self.edge1 = EdgeConv(channels, width, 2, groups, pair_features=pairs, rngs=rngs)
-        self.edge2 = EdgeConv(width, width, 2, groups, pair_features=pairs if self.chiral else 0, rngs=rngs)
+        self.edge2 = EdgeConv(width, width, 2, groups, pair_features=later_pairs, rngs=rngs)
         self.edge3 = EdgeConv(width, width, 1, groups, rngs=rngs)
         self.embedding = NormalizedLinear(3 * width, config.embedding_width, groups, rngs=rngs)
         self.out = NormalizedLinear(config.embedding_width + 3 * width, config.scene_width, groups, rngs=rngs)
         self.num_neighbors = config.num_neighbors
         self.graph = config.graph
+        self.chiral = config.inputs == "chiral"
 
     def __call__(
         self,
@@ -53,25 +53,29 @@ class Encoder(nnx.Module):
         k = min(self.num_neighbors, inputs.xyz.shape[0])
         edge_mask = None if mask is None else mask[:, None] & (jnp.arange(k)[None, :] < mask.sum())
         graph = neighbor_graph(inputs.xyz, k, mask)
-        pairs = inputs.pair_features(graph, self.chiral)
-        x1 = self.edge1(inputs.point_features, graph, compute, None, edge_mask, pairs)
+        x1 = self.edge1(
+            inputs.point_features, graph, compute, None, edge_mask, inputs.pair_features(graph, self.chiral)
+        )
         if keypoint_indices is None:
-            if self.graph == "dynamic":
-                graph = neighbor_graph(x1, k, mask)
-                pairs = inputs.pair_features(graph, True) if self.chiral else None
-            x2 = self.edge2(x1, graph, compute, None, edge_mask, pairs if self.chiral else None)
+            graph = graph if self.graph == "static" else neighbor_graph(x1, k, mask)
+            x2 = self.edge2(x1, graph, compute, None, edge_mask, self._later_pairs(inputs, graph))
             graph = graph if self.graph == "static" else neighbor_graph(x2, k, mask)
             x3 = self.edge3(x2, graph, compute, None, edge_mask)
         else:
             centers = x1[keypoint_indices]
             graph = graph[keypoint_indices] if self.graph == "static" else k_nearest(centers, x1, k, mask)
             edge_mask = None if edge_mask is None else edge_mask[keypoint_indices]
-            pairs = inputs.pair_features(graph, True, keypoint_indices) if self.chiral else None
-            x2 = self.edge2(x1, graph, compute, centers, edge_mask, pairs)
+            x2 = self.edge2(x1, graph, compute, centers, edge_mask, self._later_pairs(inputs, graph, keypoint_indices))
             x1, x3, mask = centers, self.edge3.complete_graph(x2, compute), None
         local = jnp.concatenate([x1, x2, x3], axis=1)
         features = self._with_global(local, compute, mask)
         return features[places] if keypoint_indices is None else features
+
+    def _later_pairs(
+        self, inputs: EncoderInputs, graph: Int[Array, "n k"], centers: Int[Array, " n"] | None = None
+    ) -> Float[Array, "n k p"] | None:
+        """Return what the second block sees of its edges; in a static graph XLA computes them once for both."""
+        return inputs.pair_features(graph, True, centers) if self.chiral else None
 
     def _with_global(
         self, local: Float[Array, "n l"], compute: Compute, mask: Bool[Array, " n"] | None

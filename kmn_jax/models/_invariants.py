@@ -18,7 +18,8 @@ Inputs = Literal["raw", "invariant", "chiral"]
 
 SCENE_CHANNELS: dict[Inputs, int] = {"raw": 6, "invariant": 4, "chiral": 5}  # of each point of a crop
 OBJECT_CHANNELS: dict[Inputs, int] = {"raw": 6, "invariant": 2, "chiral": 2}  # of each point of an object's cloud
-PAIR_CHANNELS: dict[Inputs, int] = {"raw": 0, "invariant": 4, "chiral": 6}  # of each edge of a neighbour graph
+PAIR_CHANNELS: dict[Inputs, int] = {"raw": 0, "invariant": 4, "chiral": 6}  # of each edge in the first block
+LATER_PAIR_CHANNELS: dict[Inputs, int] = {"raw": 0, "invariant": 0, "chiral": 6}  # and in the second
 
 
 class EncoderInputs(NamedTuple):

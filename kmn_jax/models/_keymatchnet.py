@@ -45,6 +45,10 @@ class Model(NamedTuple):
         """The config that the network was built from."""
         return nnx.merge(*self).config
 
+    def under(self, config: KeyMatchNetConfig) -> Model:
+        """Return the same parameters in a network of another config, on which their shapes must not depend."""
+        return Model(model_structure(config).graphdef, self.parameters)
+
 
 ModelPair: TypeAlias = tuple[nnx.GraphDef, nnx.State] | Any  # judged at the edge, like arrays
 

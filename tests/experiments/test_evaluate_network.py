@@ -87,7 +87,7 @@ def test_the_released_model_does_what_its_card_says(tmp_path: Path) -> None:
     results = json.loads(path.read_text())
     card = evaluate_network.SHIPPED.with_suffix(".md").read_text()
     assert results["sha256"][:16] in card
-    assert load_pretrained("small").config.num_keypoints == 64  # of which the table has 20, as published
+    assert load_pretrained("small").config.num_keypoints == 64
     # Two objects of a few images: less exact than the card's seven, and better than chance by far.
     found, *_ = results["splits"]
     assert found["segmentation"] > 0.93
@@ -122,12 +122,22 @@ def test_a_release_holds_weights_curve_picture_and_card(run: Path, evaluation: P
     for fact in (
         "160 seen by these weights",
         "keypoint accuracy 0.020",
-        "The published network saw 27,840,000.",
+        "174000 times as many",
         "abc",
         "test, small",
         "experiments.train small --seed 1",
     ):
         assert fact in card, fact
+
+
+def test_a_card_tells_what_a_run_went_on_from(run: Path, evaluation: Path, tmp_path: Path) -> None:
+    again = Path(shutil.copytree(run, tmp_path / "again"))
+    config = json.loads((again / "config.json").read_text())
+    (again / "config.json").write_text(json.dumps(config | {"warm_start": "other"}))
+    assert release.main([str(again), str(evaluation), "--folder", str(tmp_path)]) == 0
+    card = (tmp_path / "tiny.md").read_text()
+    assert "They went on from the weights `other`" in card
+    assert "times as many" not in card  # samples of the weights before are not counted
 
 
 def test_a_table_of_other_weights_is_refused(

@@ -17,12 +17,6 @@ def mirrored(cloud: np.ndarray) -> np.ndarray:
     return cloud * np.float32([-1, 1, 1, -1, 1, 1])
 
 
-def turned(cloud: np.ndarray) -> np.ndarray:
-    rotation, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
-    rotation = (rotation * np.sign(np.linalg.det(rotation))).astype(np.float32)
-    return np.concatenate([cloud[:, :3] @ rotation.T, cloud[:, 3:] @ rotation.T], axis=1)
-
-
 def features(model: Model, crop: np.ndarray, cloud: np.ndarray) -> list[np.ndarray]:
     part = encode_object(model, cloud, KEYPOINTS, 50.0)
     return [np.asarray(encode_scene(model, crop, 50.0)), np.asarray(part.features)]
@@ -37,15 +31,6 @@ def test_only_chiral_inputs_tell_a_shape_from_its_mirror_image() -> None:
     blind, seeing = (small_model(inputs=inputs, graph="static") for inputs in ("invariant", "chiral"))
     assert_close(features(blind, mirrored(crop), mirrored(cloud)), features(blind, crop, cloud), 1e-3)
     assert min(largest_change(features(seeing, mirrored(crop), mirrored(cloud)), features(seeing, crop, cloud))) > 0.02
-
-
-@pytest.mark.parametrize("graph", ["static", "dynamic"])
-def test_chiral_inputs_do_not_know_the_rotation(graph: str) -> None:
-    model = small_model(inputs="chiral", graph=graph)
-    crop, cloud = scene_crop(7, 200), box_cloud(17, 280)
-    got, want = logits(model, turned(crop), turned(cloud), 50.0), logits(model, crop, cloud, 50.0)
-    same = np.abs(got[0] - want[0]) < 1e-2 * np.ptp(want[0])
-    assert same.mean() > (0.98 if graph == "dynamic" else 0.999)  # a near-tie in feature space may flip
 
 
 def test_pair_volumes_are_those_of_a_determinant() -> None:

@@ -141,8 +141,9 @@ def test_object_length_defaults_to_its_diameter() -> None:
     np.testing.assert_array_equal(part.keypoints, cloud[KEYPOINTS])
 
 
-def test_invariant_inputs_do_not_know_the_rotation() -> None:
-    model = small_model(inputs="invariant")
+@pytest.mark.parametrize("inputs", ["invariant", "chiral"])
+def test_invariant_inputs_do_not_know_the_rotation(inputs: str) -> None:
+    model = small_model(inputs=inputs)
     crop, cloud = scene_crop(7, 200), box_cloud(17, 280)
     rotation, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
     rotation = (rotation * np.sign(np.linalg.det(rotation))).astype(np.float32)
@@ -150,7 +151,7 @@ def test_invariant_inputs_do_not_know_the_rotation() -> None:
     def rotated(x: np.ndarray) -> np.ndarray:
         return np.concatenate([x[:, :3] @ rotation.T, x[:, 3:] @ rotation.T], axis=1)
 
-    static = small_model(inputs="invariant", graph="static")
+    static = small_model(inputs=inputs, graph="static")
     assert_close(logits(static, rotated(crop), rotated(cloud), 50.0), logits(static, crop, cloud, 50.0), 1e-3)
     a, b = logits(model, rotated(crop), rotated(cloud), 50.0), logits(model, crop, cloud, 50.0)
     assert (np.abs(a[0] - b[0]) < 1e-2 * np.ptp(b[0])).mean() > 0.98  # a feature-space near-tie may flip
