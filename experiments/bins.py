@@ -82,6 +82,7 @@ class WorldImage(TrueImage):
 
     family: str
     object_id: int  # of the part
+    kind: int  # that parts of one family share
     scan: Scan
 
 
@@ -143,6 +144,7 @@ def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldIm
     targets = read_targets(folder)
     dataset, parts = _opened(folder, SPLIT, model)
     kinds = {object_id: kind_of(dataset.model(object_id).name or "") for object_id in parts}
+    numbers = {kind: number for number, kind in enumerate(dict.fromkeys(kinds.values()))}
     keys = set(dataset.keys)
     for key, object_id, family in targets[::every]:
         if key not in keys or object_id not in parts:
@@ -159,6 +161,7 @@ def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldIm
             *_truth(frame.instances or ()),
             family,
             object_id,
+            numbers[kinds[object_id]],
             _scan(frame),
         )
 

@@ -27,7 +27,6 @@ from experiments.bins import THRESHOLD, TrueImage, bin_images, world_images
 from experiments.fpfh import fpfh_poses
 from experiments.reliability_picture import reliability_table, save_reliability
 from experiments.test_sets import SPLIT
-from experiments.worlds import PARTS_A_FAMILY
 from kmn_jax.detection import (
     EVIDENCE,
     Calibration,
@@ -149,7 +148,7 @@ def _images(options: Options, model: Model) -> Iterator[tuple[int, TrueImage, Sc
     if options.worlds is not None:
         for found in tqdm(world_images(options.worlds, model), unit="image", desc="worlds"):
             with suppress(InputError):  # a scan without foreground, as of an empty table
-                yield (found.object_id - 1) // PARTS_A_FAMILY, found, make_scene(found.scan, found.part.diameter)
+                yield found.kind, found, make_scene(found.scan, found.part.diameter)
 
 
 def _refined(search: Search, chooser: Calibration, config: SearchConfig) -> Candidates | None:

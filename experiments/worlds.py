@@ -50,7 +50,6 @@ from kmn_jax.simulate import (
 )
 
 NAMES, TARGETS = "worlds.json", "test_targets_bop19.json"
-PARTS_A_FAMILY = 2
 _ABSENT = 4  # of so many images one shows no copy of the part that is asked for
 _KINDS = 3  # of other parts in an image, those of about the size of the one that is asked for
 _TRIES = 6  # of an image's container, until parts come to rest in it
@@ -102,12 +101,13 @@ class Recipe:
     random_seed: int
     parts: tuple[str, ...]  # families of them
     wider: float  # by which factor the ranges of containers are moved, so that sets differ in them
-    images: int = 8  # of each family
+    parts_a_family: int = 2
+    images: int = 8  # of each family of worlds
     size: tuple[int, int] = (1280, 960)  # of an image, in pixels
     families: tuple[Family, ...] = FAMILIES  # one scene each
 
 
-VALIDATION = Recipe(11, VALIDATION_FAMILIES, 1.0)
+VALIDATION = Recipe(11, VALIDATION_FAMILIES, 1.0, parts_a_family=4, images=16)
 TEST = Recipe(12, TEST_FAMILIES, 1.15)
 
 
@@ -118,7 +118,7 @@ def build_worlds(folder: Path, recipe: Recipe, workers: int | None = None) -> st
     """
     claim(folder, asdict(recipe))
     (folder / ".parts").mkdir(exist_ok=True)
-    parts = write_parts(folder / ".parts", recipe.parts, PARTS_A_FAMILY, recipe.random_seed)
+    parts = write_parts(folder / ".parts", recipe.parts, recipe.parts_a_family, recipe.random_seed)
     numbers = range(1, len(recipe.families) + 1)
     write_scenes(folder, _write_family, dict.fromkeys(numbers, (recipe, parts)), parts, workers)
     targets = [

@@ -36,7 +36,9 @@ import numpy as np
 from kmn_jax.errors import InputError
 
 Source = Literal["bop", "clouds"]
-METHODS = ("ours", "ours_ransac", "ours_no_normals", "ours_open3d", "fpfh", "fgr", "ppf", "kiss")
+METHODS = (
+    "ours", "ours_ransac", "ours_no_normals", "ours_open3d", "fpfh", "fpfh_best", "fgr", "ppf", "ppf_best", "kiss"
+)  # fmt: skip
 OWN_NETWORKS = "per_object"  # a method, too, for which networks have to be given
 
 

@@ -34,7 +34,7 @@ class Refinement:
         origin = case.points[0].astype(np.float64)
         pose = T_camera_object.copy()
         pose[:3, 3] -= origin
-        points, normals, mask = _points(padded(case.points), self._diameter, jax.random.key(case.random_seed))
+        points, normals, mask = _points(padded(case.points), self._diameter, jax.random.key(case.random_seed), _POINTS)
         fine = _fine(
             self._points,
             points,
@@ -48,15 +48,14 @@ class Refinement:
         return pose
 
 
-@jax.jit
-def _points(
-    cloud: PaddedCloud, diameter: Scalar, key: PRNGKey
+def crop_points(
+    cloud: PaddedCloud, diameter: Scalar, key: PRNGKey, count: int
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"]]:
-    """Return points around a cloud's first one, relative to it, smoothed, with their normals; and which are real."""
+    """Return so many points around a cloud's first one, relative to it, smoothed, with normals; and which are real."""
     offsets = cloud.points - cloud.points[:1]
     inside = cloud.mask & ((offsets**2).sum(axis=1) <= diameter**2)
     key = jax.random.split(key, 3)[0]
-    rows, drawn, kept = draw_rows(key, inside.astype(jnp.float32), jnp.int32(0), jnp.bool_(True), _DRAWN, _POINTS)
+    rows, drawn, kept = draw_rows(key, inside.astype(jnp.float32), jnp.int32(0), jnp.bool_(True), _DRAWN, count)
     around = jnp.where(drawn[:, None], offsets[rows], 0)
     mask = drawn[kept]
     camera = -cloud.points[0]
@@ -64,4 +63,5 @@ def _points(
     return points, normals, mask
 
 
+_points = jax.jit(crop_points, static_argnames="count")
 _fine = jax.jit(partial(icp, config=CONFIG))

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from experiments.evaluation.best_of import SeveralPoses
 from experiments.evaluation.cases import Case, Solver
 from kmn_jax.geometry import pad_cloud, smoothed
 from kmn_jax.objects import ObjectModel
@@ -62,6 +63,10 @@ class Fpfh:
 
     def prepare(self, model: ObjectModel) -> Solver:
         """Return a solver that describes each crop anew."""
+        return first_of(self.prepare_several(model))
+
+    def prepare_several(self, model: ObjectModel) -> SeveralPoses:
+        """Return what searches a crop, which it describes once, with several random seeds."""
         return _described_solver(
             model, self.features, lambda source, target: self.registered(source, target, model.diameter)
         )
@@ -121,12 +126,12 @@ class FastGlobal:
                 source.cloud, target.cloud, source.features, target.features, option
             )
 
-        return _described_solver(model, self.features, registered)
+        return first_of(_described_solver(model, self.features, registered))
 
 
 @dataclass(frozen=True)
 class PointPairs:
-    """Point pair features and voting (OpenCV's ppf_match_3d); the best pose is taken.
+    """Point pair features and voting (OpenCV's ppf_match_3d); the pose with the most votes is taken.
 
     The package thins a scan by shares of its bounding box; here it is thinned to voxels before, and only what is
     nearer than half of that is merged.
@@ -145,23 +150,25 @@ class PointPairs:
 
     def prepare(self, model: ObjectModel) -> Solver:
         """Hash the model's pairs, once for all noises and settings of the search; solving samples and votes."""
+        return first_of(self.prepare_several(model))
+
+    def prepare_several(self, model: ObjectModel) -> SeveralPoses:
+        """Return what gives the poses with the most votes, poses alike taken together."""
         detector = _hashed(model, self.sampling)
         compile_smoothing(self.features)
 
-        def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
+        def solve(case: Case, count: int) -> list[Float[np.ndarray, "4 4"]]:
             target = thinned_cloud(case.points, None, self.features, model.diameter)
             # Relative to the seed: floats of millimetres far from the sensor would lose digits.
             offsets = np.asarray(target.points) - case.points[0]
             if len(offsets) < _LEAST_POINTS:
-                return None
+                return []
             cloud = np.concatenate([offsets, np.asarray(target.normals)], axis=1).astype(np.float32)
             merged = self.features.voxel * model.diameter / 2
             found = detector.match(cloud, self.scene_share, merged / float(np.ptp(offsets, axis=0).max()))
-            if not len(found):
-                return None
-            pose = np.array(found[0].pose, dtype=np.float64)
-            pose[:3, 3] += case.points[0]
-            return pose if np.isfinite(pose).all() else None
+            poses = np.array([one.pose for one in found[:count]], dtype=np.float64).reshape(-1, 4, 4)
+            poses[:, :3, 3] += case.points[0]
+            return [pose for pose in poses if np.isfinite(pose).all()]
 
         return solve
 
@@ -354,16 +361,26 @@ def described(
 
 def _described_solver(
     model: ObjectModel, settings: FeatureSettings, registered: Callable[[Described, Described], Any]
-) -> Solver:
-    """Return a solver that describes a crop and registers the object, which is described once."""
+) -> SeveralPoses:
+    """Return what describes a crop and registers the object, which is described once, with several random seeds."""
     open3d = quiet_open3d()
     source = described(model.points, model.normals, settings, model.diameter)
     compile_smoothing(settings)
 
-    def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
-        open3d.utility.random.seed(case.random_seed % 2**31)
+    def solve(case: Case, count: int) -> list[Float[np.ndarray, "4 4"]]:
         target = described(case.points, None, settings, model.diameter)
-        found = None if source is None or target is None else registered(source, target)
-        return None if found is None else np.array(found.transformation)
+        if source is None or target is None:
+            return []
+        poses = []
+        for number in range(count):
+            open3d.utility.random.seed((case.random_seed + number) % 2**31)
+            if (found := registered(source, target)) is not None:
+                poses.append(np.array(found.transformation))
+        return poses
 
     return solve
+
+
+def first_of(several: SeveralPoses) -> Solver:
+    """Return a solver that gives the first pose alone."""
+    return lambda case: next(iter(several(case, 1)), None)

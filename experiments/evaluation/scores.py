@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Shaped
 
 from experiments.bins import adi_of_pairs, mssd_of_pairs
 from experiments.evaluation.configs import noise_name
@@ -44,6 +44,7 @@ class Cell:
     on_seed: Bool[np.ndarray, " c"]  # whether that copy is the one that the crop is around
     diagonal: Float[np.ndarray, " c"]  # of the object's bounding box, in diameters
     seconds: Float[np.ndarray, " c"]
+    scenes: Shaped[np.ndarray, " c"]  # what crops of one scan share
     offsets: Offsets | None = None
 
     def recall(self, gate: str = "diameter") -> float:
@@ -57,6 +58,20 @@ class Cell:
     def seed_recall(self) -> float:
         """Return the share of poses that are right, within a tenth of the diameter, on the copy the crop is around."""
         return float((self._right("diameter") & self.on_seed).mean()) if len(self.errors) else float("nan")
+
+    def ahead_of(self, other: Cell, gate: str = "diameter") -> tuple[float, float, float]:
+        """Return by how much recall is higher than another method's on the same crops, with its 95% interval.
+
+        Crops of one scan may go wrong together: the interval is that of sums over scans, which are independent
+        (cluster-robust, normal).
+        """
+        apart = self._right(gate).astype(float) - other._right(gate)
+        if not len(apart):
+            return 0.0, -1.0, 1.0
+        _, scan = np.unique(self.scenes, return_inverse=True)
+        sums = np.bincount(scan, apart - apart.mean())
+        half = _Z * float(np.sqrt((sums**2).sum() * len(sums) / max(len(sums) - 1, 1))) / len(apart)
+        return float(apart.mean()), float(apart.mean()) - half, float(apart.mean()) + half
 
     def _right(self, gate: str) -> np.ndarray:
         size = self.diagonal if gate == "diagonal" else np.ones_like(self.errors)
@@ -77,7 +92,7 @@ def wilson(right: int, total: int) -> tuple[float, float]:
 def pooled(cells: Sequence[Cell], name: str) -> Cell:
     """Return cells of one method and noise as one."""
     first = cells[0]
-    fields = ("errors", "on_seed", "diagonal", "seconds")
+    fields = ("errors", "on_seed", "diagonal", "seconds", "scenes")
     columns = {field: np.concatenate([getattr(cell, field) for cell in cells]) for field in fields}
     offsets = [cell.offsets for cell in cells if cell.offsets is not None]
     together = Offsets(*map(np.concatenate, zip(*offsets, strict=True))) if len(offsets) == len(cells) else None
@@ -92,6 +107,7 @@ def cells_of(
     for name, model in models.items():
         for noise in noises:
             truth = folder.truth(name, noise)
+            scenes = np.array([f"{name}/{case.rpartition('/')[0]}" for case in truth.names], dtype=np.str_)
             for key, title in methods.items():
                 found = folder.read(key, name, noise)
                 coarse, refined = (
@@ -100,7 +116,9 @@ def cells_of(
                 size = np.full(len(coarse.errors), model.diagonal / model.diameter)
                 total = found.seconds + found.refine_seconds
                 for text, scored, seconds in ((title, coarse, found.seconds), (f"{title} + ICP", refined, total)):
-                    cells.append(Cell(text, name, noise, scored.errors, scored.on_seed, size, seconds, scored.offsets))
+                    cells.append(
+                        Cell(text, name, noise, scored.errors, scored.on_seed, size, seconds, scenes, scored.offsets)
+                    )
     return cells
 
 
@@ -181,6 +199,21 @@ def recall_rows(cells: Sequence[Cell], objects: str) -> list[dict[str, Any]]:
         row["mean ms"] = float(everything.mean() * 1e3) if len(everything) else None
         row["median ms"] = float(np.median(everything) * 1e3) if len(everything) else None
         row["crops"] = len(everything)
+        rows.append(row)
+    return rows
+
+
+def paired_rows(cells: Sequence[Cell], own: str) -> list[dict[str, Any]]:
+    """Return a table's rows: for each other method, by how much our own finds more of the same crops."""
+    by_method = {method: _by_noise(those, "") for method, those in _by_method(cells).items()}
+    ours = by_method.pop(own)
+    rows = []
+    for method, whole in by_method.items():
+        row: dict[str, Any] = {"method": method}
+        for noise, theirs in whole.items():
+            for gate, name in (("diameter", noise_name(noise)), ("diagonal", f"{noise_name(noise)}, by diagonal")):
+                ahead, low, high = ours[noise].ahead_of(theirs, gate)
+                row[name] = f"{ahead:+.3f} ({low:+.3f} to {high:+.3f})"
         rows.append(row)
     return rows
 

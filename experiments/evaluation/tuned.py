@@ -10,19 +10,22 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from experiments.evaluation.best_of import BestOf
 from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kiss, PointPairs, missing
+
+_FPFH = Fpfh(features=FeatureSettings(voxel=0.05))
+_PPF = PointPairs(scene_share=0.05, features=FeatureSettings(voxel=0.1, smooth=True))
 
 # By the names of the methods: the package that is needed, and what makes the rival.
 RIVALS: Mapping[str, tuple[str, Callable[[], Any]]] = {
-    "fpfh": ("open3d", lambda: Fpfh(features=FeatureSettings(voxel=0.05))),
+    "fpfh": ("open3d", lambda: _FPFH),
+    "fpfh_best": ("open3d", lambda: BestOf("FPFH + RANSAC, best of 4", _FPFH, 4)),
     "fgr": (
         "open3d",
         lambda: FastGlobal(features=FeatureSettings(voxel=0.02), gate=0.05, tuples=3000, tuple_scale=0.9),
     ),
-    "ppf": (
-        "cv2.ppf_match_3d",
-        lambda: PointPairs(scene_share=0.05, features=FeatureSettings(voxel=0.1, smooth=True)),
-    ),
+    "ppf": ("cv2.ppf_match_3d", lambda: _PPF),
+    "ppf_best": ("cv2.ppf_match_3d", lambda: BestOf("PPF, best of 16", _PPF, 16)),
     "kiss": ("kiss_matcher", lambda: Kiss(voxel=0.015, features=FeatureSettings(voxel=0.01, smooth=True))),
 }
 

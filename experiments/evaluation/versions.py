@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
+from experiments.evaluation.best_of import BestOf, Several
 from experiments.evaluation.cases import Method
 from experiments.evaluation.methods import Ours, OwnNetworks
 
@@ -28,6 +29,7 @@ VERSIONS = {
     "FastGlobal": 1,
     "PointPairs": 1,
     "Kiss": 1,
+    "BestOf": 1,  # the choice among several poses, beside the method that they are of
 }
 _SHARED = ("cases", "refinement")
 _LIBRARIES = ("jax", "jaxlib", "numpy", "open3d")  # of all methods: open3d reads scans
@@ -38,11 +40,13 @@ def shared_versions() -> dict[str, Any]:
     return {stage: VERSIONS[stage] for stage in _SHARED} | _of_libraries(_LIBRARIES)
 
 
-def versions_of(method: Method) -> dict[str, Any]:
+def versions_of(method: Method | Several) -> dict[str, Any]:
     """Return the versions that decide the poses of a method alone."""
     stages: list[type] = [Ours if isinstance(method, OwnNetworks) else type(method)]
     if isinstance(method, Ours) and method.search is not None:
         stages.append(type(method.search))
+    if isinstance(method, BestOf):
+        return versions_of(method.base) | {"BestOf": VERSIONS["BestOf"]}
     library = getattr(method, "library", None)
     return {kind.__name__: VERSIONS[kind.__name__] for kind in stages} | _of_libraries([library] if library else [])
 

@@ -19,6 +19,7 @@ from experiments.evaluation.scores import (
     accuracy_rows,
     cells_of,
     object_rows,
+    paired_rows,
     pooled,
     recall_rows,
     seed_rows,
@@ -95,7 +96,9 @@ def test_how_exact_poses_are(exported: Export, model: ObjectModel) -> None:
 
 
 def test_the_gate_by_the_diagonal_is_the_wider_one(model: ObjectModel) -> None:
-    cell = Cell("m", "o", 0.0, np.array([0.05, 0.105, 0.2]), np.ones(3, bool), np.full(3, 1.1), np.ones(3))
+    cell = Cell(
+        "m", "o", 0.0, np.array([0.05, 0.105, 0.2]), np.ones(3, bool), np.full(3, 1.1), np.ones(3), np.full(3, "scan")
+    )
     assert cell.recall("diameter") == pytest.approx(1 / 3)
     assert cell.recall("diagonal") == pytest.approx(2 / 3)
 
@@ -114,7 +117,8 @@ def test_an_interval_of_nothing_is_everything() -> None:
 
 def cell(method: str, name: str, right: int, total: int = 100, noise: float = 0.0) -> Cell:
     errors = np.where(np.arange(total) < right, 0.0, np.inf)
-    return Cell(method, name, noise, errors, errors < 1, np.ones(total), np.full(total, 0.01))
+    scans = np.array([f"{name}/{row % 20}" for row in range(total)])
+    return Cell(method, name, noise, errors, errors < 1, np.ones(total), np.full(total, 0.01), scans)
 
 
 def test_tables_and_where_others_find_more() -> None:
@@ -135,6 +139,22 @@ def test_tables_and_where_others_find_more() -> None:
     assert pooled([cells[0], cells[2]], "all").recall() == pytest.approx(0.85)
 
 
+def test_paired_differences_take_scans_as_independent() -> None:
+    own, other = cell("kmn_jax + ICP", "a", 100), cell("FPFH", "a", 100)
+    lost = np.where(np.isin(other.scenes, ["a/0", "a/1"]), np.inf, 0.0)
+    ahead, low, high = own.ahead_of(replace(other, errors=lost))
+    spread = 1.959964 * np.sqrt(0.1 * 0.9 / 19)  # two scans of twenty, in which all five crops go wrong together
+    np.testing.assert_allclose([ahead, low, high], [0.1, 0.1 - spread, 0.1 + spread], atol=1e-9)
+    apart = replace(other, errors=lost, scenes=np.arange(100).astype(str))
+    assert apart.ahead_of(own)[2] - apart.ahead_of(own)[1] < 1.5 * spread
+    assert own.ahead_of(own) == (0.0, 0.0, 0.0)
+    cells = [own, replace(other, errors=lost)] + [replace(one, noise=0.05) for one in (own, other)]
+    (row,) = paired_rows(cells, "kmn_jax + ICP")
+    assert row["method"] == "FPFH"
+    assert row["noise 0%"].startswith("+0.100 (-0.0")
+    assert row["noise 5%, by diagonal"] == "+0.000 (+0.000 to +0.000)"
+
+
 def test_the_headline_is_of_all_objects_without_noise() -> None:
     cells = [cell("kmn_jax + ICP", "a", 80), cell("kmn_jax + ICP", "b", 90), cell("FPFH", "a", 60)]
     cells += [cell("FPFH", "b", 70), cell("FPFH + ICP", "a", 70), cell("FPFH + ICP", "b", 80)]
@@ -153,7 +173,7 @@ def test_the_headline_is_of_all_objects_without_noise() -> None:
 def test_methods_that_find_more_are_named_at_either_gate() -> None:
     own, near = "kmn_jax + ICP", "kmn_jax, trained for the object"
     errors = np.where(np.arange(100) < 85, 0.105, np.inf)  # right by the diagonal alone
-    wide = Cell(near, "b", 0.0, errors, errors < 1, np.full(100, 1.1), np.full(100, 0.01))
+    wide = replace(cell(near, "b", 85), errors=errors, diagonal=np.full(100, 1.1))
     cells = [cell(own, "a", 80), cell("FPFH", "a", 99), cell(own, "b", 90), cell("FPFH", "b", 91), wide]
     cells += [cell("kmn_jax", "a", 90), cell(near, "a", 80)]
     lines = beaten_by(cells, own, {"FPFH", near})

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from experiments import evaluate
+from experiments.evaluation.best_of import BestOf, SeveralPoses
 from experiments.evaluation.cases import Case, Method, ObjectImages, draw_cases
 from experiments.evaluation.configs import find_config
 from experiments.evaluation.methods import Ours, OwnNetworks
@@ -125,6 +126,23 @@ def fpfh() -> np.ndarray:
     return np.append(found.features.data.mean(axis=1) / 100, np.log(len(found.cloud.points)))
 
 
+class Known:
+    """Poses that are known: turned over, moved into the part, and the true one."""
+
+    @property
+    def settings(self) -> dict[str, bool]:
+        return {"known": True}
+
+    def prepare_several(self, _: ObjectModel) -> SeveralPoses:
+        def solve(case: Case, count: int) -> list[np.ndarray]:
+            true = case.T_camera_object[0]
+            turned, deep = true @ np.diag([1.0, -1, -1, 1]), true.copy()
+            deep[:3, 3] += 0.3 * gear().model.diameter * true[:3, 3] / np.linalg.norm(true[:3, 3])
+            return [turned, deep, true][:count]
+
+        return solve
+
+
 # What rounding may change, as on another processor; of a diameter, or of what a rotation holds.
 TOLERANCES = dict.fromkeys(VERSIONS, 0.02) | {"FastGlobal": 0.1, "Kiss": 0.05}
 STAGES: dict[str, Callable[[], np.ndarray]] = {
@@ -136,6 +154,7 @@ STAGES: dict[str, Callable[[], np.ndarray]] = {
     "FastGlobal": lambda: solved(METHODS["fgr"]),
     "PointPairs": lambda: solved(replace(METHODS["ppf"], sampling=0.1)),
     "Kiss": lambda: solved(METHODS["kiss"]),
+    "BestOf": lambda: solved(BestOf("some", Known(), 3)),
 }
 
 
@@ -161,10 +180,11 @@ def recipe(**changed: Any) -> dict[str, Any]:
         ("refinement", "versions"),
         ("Ours", "method open3d, method ours, method own"),
         ("OverMatches", "method open3d"),
-        ("Fpfh", "method fpfh"),
+        ("Fpfh", "method fpfh, method fpfh_best"),
         ("FastGlobal", "method fgr"),
-        ("PointPairs", "method ppf"),
+        ("PointPairs", "method ppf, method ppf_best"),
         ("Kiss", "method kiss"),
+        ("BestOf", "method fpfh_best, method ppf_best"),
     ],
 )
 def test_a_raised_version_makes_the_poses_of_its_own_stage_stale(
@@ -207,7 +227,7 @@ def test_versions_name_every_method_and_the_library_that_is_its_alone() -> None:
     named = [versions_of(method) for method in METHODS.values()]
     assert named[0] == {"Fpfh": VERSIONS["Fpfh"]}
     assert {"kiss-matcher", "opencv-contrib-python-headless"} <= {name for one in named for name in one}
-    kinds = {kind.__name__ for kind in (Ours, OverMatches, Fpfh, FastGlobal, PointPairs, Kiss)}
+    kinds = {kind.__name__ for kind in (Ours, OverMatches, Fpfh, FastGlobal, PointPairs, Kiss, BestOf)}
     assert set(STAGES) == set(VERSIONS) == {"cases", "refinement"} | kinds
 
 
