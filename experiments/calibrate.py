@@ -14,7 +14,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -96,8 +96,7 @@ class Search(NamedTuple):
 def collect(options: Options) -> dict[str, np.ndarray]:
     """Return evidence, outcome and object of all poses, and whether they are refined."""
     model = load_pretrained() if options.model is None else load_model(options.model)
-    config = DetectConfig().search
-    config = replace(config, crops=config.crops.of_network(model.config))
+    config = DetectConfig().search_of(model.config)
     searches = list(_searches(options, model, config))
     found = _joined([search.columns(search.found) for search in searches])
     chooser = fit_calibration(found["evidence"], found["error"] < THRESHOLD, EVIDENCE)

@@ -59,6 +59,7 @@ class CropSearchConfig:
 
     num_draws: int = 4  # of points that the network sees, at most
     enough: float | None = 0.7  # of a pose's surface score, -1 to 3: then no more draws are made; None: all are made
+    give_up: bool = False  # make no more draws where the first one has no pose: a few copies fewer for far less time
     side_by_side: bool | None = None  # all draws at once; None: unless JAX runs on a CPU
     num_modes: int = 4  # poses of each draw that are compared with the surface
     num_poses: int = 3  # that are refined and returned: the best ones that differ
@@ -219,8 +220,8 @@ def draws_in_turn(
     """Make draws one after the other, given what makes one and what scores its poses by the draws so far."""
 
     def more(state: DrawsSearch) -> Bool[Array, ""]:
-        left = (state.num_draws < config.num_draws) & (valid | (state.num_draws == 0))
-        return left if config.enough is None else left & (state.scores.max() < config.enough)
+        wanted = valid & (state.num_draws < config.num_draws) & is_unsure(state.scores.max(), config)
+        return (state.num_draws == 0) | wanted
 
     def make(state: DrawsSearch) -> DrawsSearch:
         draw = state.num_draws
@@ -254,12 +255,15 @@ def draws_side_by_side(
 
 def draws_needed(scores: Float[Array, "d h"], valid: Bool[Array, ""], config: CropSearchConfig) -> Int[Array, ""]:
     """Return how many draws of such scores are made one after the other."""
-    if config.enough is None:
-        number = jnp.int32(config.num_draws)
-    else:
-        unsure = jax.lax.cummax(scores.max(axis=1)) < config.enough
-        number = jnp.minimum(unsure.sum(dtype=jnp.int32) + 1, config.num_draws)
+    unsure = jax.lax.cummin(is_unsure(jax.lax.cummax(scores.max(axis=1)), config).astype(jnp.int32))
+    number = jnp.minimum(unsure.sum(dtype=jnp.int32) + 1, config.num_draws)
     return jnp.where(valid, number, 1)
+
+
+def is_unsure(best: Float[Array, "*d"], config: CropSearchConfig) -> Bool[Array, "*d"]:
+    """Tell whether more draws are wanted after some of which the best pose has this score, minus infinity of none."""
+    unsure = best < (jnp.inf if config.enough is None else config.enough)
+    return unsure & (best > -jnp.inf) if config.give_up else unsure
 
 
 def _first(draws: _Draws, number: Int[Array, ""]) -> _Draws:

@@ -37,7 +37,7 @@ from kmn_jax.detection._selection import Selection, select_poses
 from kmn_jax.detection._timing import Clock
 from kmn_jax.errors import InputError
 from kmn_jax.io import object_doubt
-from kmn_jax.models import Model
+from kmn_jax.models import KeyMatchNetConfig, Model
 from kmn_jax.objects import Part
 from kmn_jax.programs import meanwhile
 
@@ -63,6 +63,7 @@ class DetectConfig:
     """How a scene is searched; lengths are shares of the object's diameter."""
 
     search: SearchConfig = field(default_factory=SearchConfig)
+    give_up: bool = True  # on seeds whose first draw has no pose; not where places are given
     patience: int | None = 2  # rounds that find no copy, after which it is not searched finely; None goes on
     later_seeds: int = 16  # at most in a round after the first; rounds go on until the foreground is covered
     most_seeds: int = 512  # at least so many are searched before it is given up to cover the foreground
@@ -81,8 +82,13 @@ class DetectConfig:
                 f" = {self.reported} and accepted = {self.accepted} probabilities in this order"
             )
 
+    def search_of(self, config: KeyMatchNetConfig, at_places: bool = False) -> SearchConfig:
+        """Return how is searched with a network: around seeds all over the scene, or at places that are given."""
+        crops = self.search.crops.of_network(config)
+        return replace(self.search, crops=replace(crops, give_up=crops.give_up or (self.give_up and not at_places)))
 
-THOROUGH = DetectConfig(patience=None)
+
+THOROUGH = DetectConfig(patience=None, give_up=False)
 
 
 def detect(
@@ -101,7 +107,7 @@ def detect(
     same inputs and `random_seed` give the same bits on one device.
     """
     clock = clock or Clock()
-    search = replace(config.search, crops=config.search.crops.of_network(model.config))
+    search = config.search_of(model.config, at_places=at is not None)
     on_device, warnings = device_part(model, part), scene.warnings
     propose = partial(search_at, model, on_device, scene, random_seed=random_seed, config=search)
     if at is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,13 @@ from kmn_jax.detection import (
     predict,
     search_draws,
 )
-from kmn_jax.detection._crop_search import crop_of_scene, draws_side_by_side, find_poses_in_crop
+from kmn_jax.detection._crop_search import (
+    DrawsSearch,
+    crop_of_scene,
+    draws_in_turn,
+    draws_side_by_side,
+    find_poses_in_crop,
+)
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import PaddedCloud
 from kmn_jax.models import Model, load_model, released_file
@@ -198,21 +205,25 @@ def test_draws_side_by_side_are_those_made_in_turn(model: Model, part: PartArray
 
 
 @pytest.mark.parametrize(
-    ("scores", "enough", "valid", "number"),
+    ("scores", "enough", "give_up", "valid", "number"),
     [
-        ([0.1, 0.8, 0.2], 0.7, True, 2),
-        ([0.9, 0.8, 0.2], 0.7, True, 1),
-        ([0.1, 0.2, 0.7], 0.7, True, 3),
-        ([-jnp.inf, -jnp.inf, -jnp.inf], 0.7, True, 3),
-        ([0.9, 0.8, 0.2], None, True, 3),
-        ([0.1, 0.2, 0.3], 0.7, False, 1),
-        ([0.1, 0.2, 0.3], None, False, 1),
+        ([0.1, 0.8, 0.2], 0.7, False, True, 2),
+        ([0.9, 0.8, 0.2], 0.7, False, True, 1),
+        ([0.1, 0.2, 0.7], 0.7, False, True, 3),
+        ([0.1, -jnp.inf, 0.7], 0.7, True, True, 3),
+        ([-jnp.inf, -jnp.inf, -jnp.inf], 0.7, False, True, 3),
+        ([-jnp.inf, 0.1, 0.2], 0.7, True, True, 1),
+        ([-jnp.inf, 0.1, 0.2], None, True, True, 1),
+        ([0.9, 0.8, 0.2], None, False, True, 3),
+        ([0.1, 0.2, 0.3], 0.7, False, False, 1),
+        ([0.1, 0.2, 0.3], None, False, False, 1),
     ],
 )
-def test_draws_side_by_side_are_forgotten_where_none_would_follow(
-    scores: list[float], enough: float | None, valid: bool, number: int
+@pytest.mark.parametrize("way", [draws_in_turn, draws_side_by_side])
+def test_no_draws_are_made_or_kept_that_are_not_wanted(
+    way: Callable[..., DrawsSearch], scores: list[float], enough: float | None, give_up: bool, valid: bool, number: int
 ) -> None:
-    config = replace(CONFIG, num_draws=3, enough=enough)
+    config = replace(CONFIG, num_draws=3, num_modes=2, enough=enough, give_up=give_up)
     poses = jnp.stack([jnp.array(scores), jnp.full(3, -jnp.inf)], axis=1)
 
     def one(draw: jax.Array) -> Any:
@@ -221,7 +232,7 @@ def test_draws_side_by_side_are_forgotten_where_none_would_follow(
     def scored(found: Any, so_far: Any) -> jax.Array:
         return poses[found - 1] + (so_far.max() - found).astype(jnp.float32)  # by no draw after it
 
-    made = draws_side_by_side(one, scored, jnp.bool_(valid), config)
+    made = way(one, scored, jnp.bool_(valid), config)
     there = np.arange(3) < number
     assert made.num_draws == number
     for draws in (made.predictions, made.poses):
