@@ -93,6 +93,7 @@ def fit_calibration(
     names: Sequence[str],
     weights: Float[np.ndarray, " s"] | None = None,
     hidden_units: int = _HIDDEN,
+    ridge: float = _RIDGE,
 ) -> Calibration:
     """Fit to poses of which it is known whether they are right; `weights` count some as several.
 
@@ -116,7 +117,7 @@ def fit_calibration(
     f, u = columns.shape[1], hidden_units
     shapes = ((f, u), (u,), (u,), (f,), ())
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
-    ridge = np.concatenate([np.full(f * u, _RIDGE), np.zeros(u), np.full(u + f, _RIDGE), np.zeros(1)])
+    ridges = np.concatenate([np.full(f * u, ridge), np.zeros(u), np.full(u + f, ridge), np.zeros(1)])
 
     def unpacked(solution: Float[np.ndarray, " g"]) -> list[Float[np.ndarray, "..."]]:
         parts = np.split(solution, ends[:-1])
@@ -126,11 +127,11 @@ def fit_calibration(
         inner, inner_bias, slopes, direct, bias = unpacked(solution)
         hidden = np.tanh(columns @ inner + inner_bias)
         logits = hidden @ slopes + columns @ direct + bias
-        value = counts @ (np.logaddexp(0, logits) - right * logits) + ridge @ solution**2 / 2
+        value = counts @ (np.logaddexp(0, logits) - right * logits) + ridges @ solution**2 / 2
         error = counts * (_logistic(logits) - right)
         back = np.outer(error, slopes) * (1 - hidden**2)
         slope = [columns.T @ back, back.sum(axis=0), hidden.T @ error, columns.T @ error, error.sum()]
-        return float(value), np.concatenate([part.reshape(-1) for part in slope]) + ridge * solution
+        return float(value), np.concatenate([part.reshape(-1) for part in slope]) + ridges * solution
 
     start = np.zeros(ends[-1])
     rng = np.random.default_rng(0)
