@@ -81,7 +81,6 @@ class WorldImage(TrueImage):
     """One image of a world; the part is the one that is asked for, and there may be no copy of it."""
 
     family: str
-    object_id: int  # of the part
     kind: int  # that parts of one family share
     scan: Scan
 
@@ -160,7 +159,6 @@ def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldIm
             _like_in_size(part, [other for number, other in parts.items() if kinds[number] != kinds[object_id]]),
             *_truth(frame.instances or ()),
             family,
-            object_id,
             numbers[kinds[object_id]],
             _scan(frame),
         )

@@ -17,7 +17,7 @@ import tyro
 from jaxtyping import Float
 
 from experiments.evaluation.predictions import Export
-from experiments.evaluation.scores import THRESHOLD, cells_of
+from experiments.evaluation.scores import THRESHOLD, cells_of, pooled
 from experiments.evaluation.sources import bop_objects
 from experiments.made_data import require_made
 from kmn_jax.errors import InputError
@@ -46,17 +46,16 @@ def compare(options: Options) -> list[dict[str, Any]]:
     titles = {name: name for name in options.methods}
     folders = [_opened(folder) for folder in (options.before, options.after)]
     before, after = (cells_of(folder, models, titles, options.noises) for folder in folders)
-    scans = {(name, noise): _scans_of(folders, name, noise) for name in models for noise in options.noises}
+    _check_crops(folders, list(models), options.noises)
     rows = []
     for method in dict.fromkeys(cell.method for cell in before):
         for noise in options.noises:
-            pairs = [
-                (one.errors < THRESHOLD, other.errors < THRESHOLD, scans[one.object, noise])
-                for one, other in zip(before, after, strict=True)
-                if (one.method, one.noise) == (method, noise)
-            ]
-            right, now, scan = (np.concatenate(columns) for columns in zip(*pairs, strict=True))
-            low, high = _interval(now.astype(float) - right, scan)
+            one, other = (
+                pooled([cell for cell in cells if (cell.method, cell.noise) == (method, noise)], "all objects")
+                for cells in (before, after)
+            )
+            right, now = one.errors < THRESHOLD, other.errors < THRESHOLD
+            low, high = _interval(now.astype(float) - right, one.scenes)
             rows.append(
                 {
                     "method": method,
@@ -78,12 +77,14 @@ def _opened(folder: Path) -> Export:
         raise InputError(f"{folder} is no folder of an evaluation ({error}): name one that evaluate wrote") from None
 
 
-def _scans_of(folders: list[Export], name: str, noise: float) -> np.ndarray:
-    """Return the scan of each crop, by its name."""
-    names, others = (folder.truth(name, noise).names for folder in folders)
-    if names != others:
-        raise InputError(f"the crops of {name} at noise {noise:g} are not the same: evaluate the same dataset twice")
-    return np.array([f"{name}/{crop.rsplit('/', 1)[0]}" for crop in names])
+def _check_crops(folders: list[Export], objects: list[str], noises: tuple[float, ...]) -> None:
+    """Raise InputError if the crops of both folders are not the same."""
+    for name, noise in ((name, noise) for name in objects for noise in noises):
+        names, others = (folder.truth(name, noise).names for folder in folders)
+        if names != others:
+            raise InputError(
+                f"the crops of {name} at noise {noise:g} are not the same: evaluate the same dataset twice"
+            )
 
 
 def _interval(difference: Float[np.ndarray, " c"], scan: np.ndarray) -> tuple[float, float]:

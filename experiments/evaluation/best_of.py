@@ -18,14 +18,14 @@ from jaxtyping import Array, Float
 
 from experiments.evaluation.cases import Case, Solver, padded
 from experiments.evaluation.refinement import crop_points
+from kmn_jax.detection import CropSearchConfig
 from kmn_jax.geometry import PaddedCloud
 from kmn_jax.objects import ObjectModel
-from kmn_jax.pose import SurfaceConfig, surface_agreement
+from kmn_jax.pose import surface_agreement
 from kmn_jax.typing import PRNGKey, Scalar
 
 _POINTS = 1024  # of a crop
-_OBJECT_POINTS = 128  # as many as our search compares
-_CONFIG = SurfaceConfig()
+_SEARCH = CropSearchConfig()  # of which the comparison is
 
 SeveralPoses: TypeAlias = Callable[[Case, int], list[Float[np.ndarray, "4 4"]]]
 
@@ -56,16 +56,15 @@ class BestOf:
             "of": dict(self.base.settings),
             "num_poses": self.num_poses,
             "points": _POINTS,
-            "object points": _OBJECT_POINTS,
-            "surface": str(_CONFIG),
+            "object points": _SEARCH.surface_points,
+            "surface": str(_SEARCH.surface),
         }
 
     def prepare(self, model: ObjectModel) -> Solver:
         """Return a solver; solving covers all poses and the choice."""
         several = self.base.prepare_several(model)
-        surface, normals = (
-            jnp.asarray(values[:_OBJECT_POINTS], dtype=jnp.float32) for values in (model.points, model.normals)
-        )
+        count = _SEARCH.surface_points
+        surface, normals = (jnp.asarray(values[:count], dtype=jnp.float32) for values in (model.points, model.normals))
         diameter = jnp.float32(model.diameter)
 
         def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
@@ -95,7 +94,7 @@ def _scores(
     points, point_normals, mask = crop_points(cloud, diameter, key, _POINTS)
 
     def score(pose: Float[Array, "4 4"]) -> Scalar:
-        given = (pose, surface, normals, points, point_normals, mask, mask, -cloud.points[0], diameter, _CONFIG)
+        given = (pose, surface, normals, points, point_normals, mask, mask, -cloud.points[0], diameter, _SEARCH.surface)
         return surface_agreement(*given).score
 
     return jax.lax.map(score, poses)

@@ -67,7 +67,7 @@ class Fpfh:
 
     def prepare_several(self, model: ObjectModel) -> SeveralPoses:
         """Return what searches a crop, which it describes once, with several random seeds."""
-        return _described_solver(
+        return _poses_of_described(
             model, self.features, lambda source, target: self.registered(source, target, model.diameter)
         )
 
@@ -126,7 +126,7 @@ class FastGlobal:
                 source.cloud, target.cloud, source.features, target.features, option
             )
 
-        return first_of(_described_solver(model, self.features, registered))
+        return first_of(_poses_of_described(model, self.features, registered))
 
 
 @dataclass(frozen=True)
@@ -359,7 +359,7 @@ def described(
     return Described(cloud, open3d.pipelines.registration.compute_fpfh_feature(cloud, near))
 
 
-def _described_solver(
+def _poses_of_described(
     model: ObjectModel, settings: FeatureSettings, registered: Callable[[Described, Described], Any]
 ) -> SeveralPoses:
     """Return what describes a crop and registers the object, which is described once, with several random seeds."""

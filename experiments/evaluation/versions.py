@@ -42,11 +42,11 @@ def shared_versions() -> dict[str, Any]:
 
 def versions_of(method: Method | Several) -> dict[str, Any]:
     """Return the versions that decide the poses of a method alone."""
+    if isinstance(method, BestOf):
+        return versions_of(method.base) | {"BestOf": VERSIONS["BestOf"]}
     stages: list[type] = [Ours if isinstance(method, OwnNetworks) else type(method)]
     if isinstance(method, Ours) and method.search is not None:
         stages.append(type(method.search))
-    if isinstance(method, BestOf):
-        return versions_of(method.base) | {"BestOf": VERSIONS["BestOf"]}
     library = getattr(method, "library", None)
     return {kind.__name__: VERSIONS[kind.__name__] for kind in stages} | _of_libraries([library] if library else [])
 
