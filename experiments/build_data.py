@@ -10,8 +10,8 @@ test-sets    7 electronic and 7 industrial objects in 20 bins each, rendered by 
              digests are compared with those in `assets/test_sets.json`.
 validation-bins  the 50 validation components in 6 bins each, rendered by ray casting, one half as a perfect sensor sees
              them, the other as a structured-light scanner: what the probabilities of detections are fitted on.
-worlds       bins, trays and tables of many kinds (`experiments/worlds.py`), of parts made by parameters: one set to fit
-             probabilities on, one to test on.
+worlds       bins, trays and tables of many kinds (`experiments/worlds.py`), of parts made by parameters: two sets to
+             fit probabilities on, one to test on.
 per-object   the pack of one part, for a network of its own: 160 training and 160 validation scenes.
 check        what a pack holds: every file against its checksum, every copy against the walls of its bin.
 small        the few objects and images that the repository carries: `assets/small_pack`, `assets/small_test_set`.
@@ -46,8 +46,8 @@ from experiments.test_sets import (
     validation_sources,
     verdict,
 )
-from experiments.training_parts import TRAINING_FAMILIES
-from experiments.worlds import TEST, VALIDATION, build_worlds
+from experiments.training_parts import PARTS_SEED, TRAINING_FAMILIES
+from experiments.worlds import TEST, TRAINING, VALIDATION, build_worlds
 from kmn_jax.data import Pack, PackConfig, PackedObject, Record, Source, build_pack
 from kmn_jax.errors import InputError
 from kmn_jax.simulate import PERFECT, BinScene, SensorConfig
@@ -61,7 +61,6 @@ SMALL_PACK = (
     "Diode_THT.3dshapes/D_DO-15_P5.08mm_Vertical_KathodeUp",
     "Package_TO_SOT_SMD.3dshapes/TSOT-23",
 )
-_PARTS_SEED = 13  # world bins have others
 SMALL_TEST_SET = ("Connector_USB.3dshapes/USB_A_TE_292303-7_Horizontal", "gear_motor")
 
 
@@ -103,9 +102,9 @@ class AllSurfels:
         sources, licence = catalogue_sources(self.models, OUTPUTS / "kicad", self.limit)
         self.folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=self.folder) as made:
-            paths = write_parts(Path(made), tuple(TRAINING_FAMILIES), self.parts, _PARTS_SEED)
+            paths = write_parts(Path(made), tuple(TRAINING_FAMILIES), self.parts, PARTS_SEED)
             sources += [Source(path.stem, "train", path) for path in paths]
-            random.Random(_PARTS_SEED).shuffle(sources)
+            random.Random(PARTS_SEED).shuffle(sources)
             config = PackConfig(drops=0)
             records = build_pack(self.folder, sources, config, workers=self.workers, licence=licence)
         print_summary(self.folder, records)
@@ -163,7 +162,7 @@ class Worlds:
     record: bool = False  # write the digests into the repository instead
 
     def run(self) -> None:
-        recipes = {"validation": VALIDATION, "test": TEST}
+        recipes = {"training": TRAINING, "validation": VALIDATION, "test": TEST}
         digests = {
             f"worlds_{name}": build_worlds(self.folder / name, own, self.workers) for name, own in recipes.items()
         }

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
+import jax
 import numpy as np
 import tyro
 from jaxtyping import Float, Int
@@ -49,10 +50,12 @@ from kmn_jax.detection import (
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
 from kmn_jax.models import Model, load_model, load_pretrained
-from kmn_jax.objects import Part
+from kmn_jax.objects import Part, model_digest
 from kmn_jax.report import check_target, print_table, write_json
 
 _LOOSE = DetectConfig(reported=0.03)  # refines more than detection does, so that the fit sees what is just refused
+_SCALE_RIDGE = 1e-4  # hardly any: it makes probabilities too modest
+_KINDS = 100  # more than the families of parts in a folder of world bins
 SHIPPED = Path(__file__).parent.parent / "kmn_jax" / "pretrained" / "small.calibration.json"
 
 
@@ -64,6 +67,7 @@ class Options:
     method: Literal["kmn_jax", "FPFH"] = "kmn_jax"
     bins: Path = Path("outputs/validation_bins")  # folder with datasets in BOP format
     worlds: Path | None = None  # folder of world bins to fit on, too: outputs/worlds/validation
+    known_worlds: Path | None = None  # the same, of parts that the network was trained with: no scale is fitted to it
     every: int = 1  # use every so many images of `bins`
     folds: int = 5
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
@@ -74,14 +78,14 @@ class Options:
 
 
 class Search(NamedTuple):
-    """What was found of one part in one image."""
+    """One image and the part that is searched in it."""
 
     image: TrueImage
     part: Part  # the image's own, or its stranger
     on_device: DevicePart
     scene: Scene
     number: int  # that searches of one object, or of one family of parts, share
-    found: Candidates
+    is_known: bool  # whether the network was trained with such parts
 
     def columns(self, found: Candidates) -> dict[str, np.ndarray]:
         """Return evidence, error and object of poses; those of a part that is not there have no finite error."""
@@ -93,68 +97,96 @@ class Search(NamedTuple):
         }
 
 
-def collect(options: Options) -> dict[str, np.ndarray]:
-    """Return evidence, outcome and object of all poses, and whether they are refined."""
-    model = load_pretrained() if options.model is None else load_model(options.model)
+def collect(options: Options, model: Model) -> dict[str, np.ndarray]:
+    """Return evidence, outcome and object of all poses, and whether they are refined, and what is judged.
+
+    Images are read twice, as they do not all fit into memory.
+    """
     config = DetectConfig().search_of(model.config)
-    searches = list(_searches(options, model, config))
-    found = _joined([search.columns(search.found) for search in searches])
-    chooser = fit_calibration(found["evidence"], found["error"] < THRESHOLD, EVIDENCE)
-    pairs = [
-        (search, refined)
-        for search in tqdm(searches, unit="search", desc="refinement")
-        if (refined := _refined(search, chooser, config)) is not None
-    ]
-    fine = _joined([search.columns(refined) for search, refined in pairs])
+    proposed, parts = [], []
+    for search in _searches(options, model):
+        found = _proposed(search, model, config, options.method)
+        parts.append(search.columns(found))
+        proposed.append(_with_poses(found))
+    poses = _joined(parts)
+    chooser = fit_calibration(poses["evidence"], poses["error"] < THRESHOLD, EVIDENCE)
+    finer, parts = [], []
+    for search, found in zip(_searches(options, model), proposed, strict=True):
+        choice = chosen(found, chooser, search.on_device, _LOOSE)
+        rows = np.flatnonzero(choice.kept | choice.contenders)
+        if len(rows):
+            refined = refined_candidates(search.on_device, search.scene, found, rows, 0, config)
+            parts.append(search.columns(refined))
+            finer.append((_without_crops(refined), search.on_device, search.number, search.is_known))
+    fine = _joined(parts)
     fine["refined"] = np.ones(len(fine["error"]), dtype=bool)
     others = {name: fitted for names, fitted in held_out_models(fine, options) for name in names}
-    kept = []
-    for search, refined in pairs:
-        choice = chosen(refined, others[search.number], search.on_device, DetectConfig())
-        kept.append(choice.kept[refined.usable])
-    none = np.zeros(len(found["error"]), dtype=bool)
-    found |= {"refined": none, "reported": none}
-    return _joined([found, fine | {"reported": np.concatenate(kept)}])
+    reported = [
+        chosen(refined, others[number], on_device, DetectConfig()).kept[refined.usable] & (not is_known)
+        for refined, on_device, number, is_known in finer
+    ]
+    none = np.zeros(len(poses["error"]), dtype=bool)
+    return _joined([poses | {"refined": none, "reported": none}, fine | {"reported": np.concatenate(reported)}])
 
 
 def _joined(columns: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([part[name] for part in columns]) for name in columns[0]}
 
 
-def _searches(options: Options, model: Model, config: SearchConfig) -> Iterator[Search]:
-    """Search all images for their parts, and every second one for a part that is not there."""
-    for count, (number, image, scene) in enumerate(_images(options, model)):
-        rows = seeds_over(scene, scene.foreground, image.part)
+def _searches(options: Options, model: Model) -> Iterator[Search]:
+    """Yield all images with their parts, and every second one with a part that is not there."""
+    for count, (number, image, scene, is_known) in enumerate(_images(options, model)):
         for part in (image.part, image.stranger if count % 2 == 0 else None):
-            if part is None:
-                continue
-            on_device = device_part(model, part)
-            if options.method == "FPFH":
-                found = fpfh_poses(part, on_device, scene, rows)
-            else:
-                found = search_at(model, on_device, scene, rows, 0, config)
-            yield Search(image, part, on_device, scene, number, found)
+            if part is not None:
+                yield Search(image, part, device_part(model, part), scene, number, is_known)
 
 
-def _images(options: Options, model: Model) -> Iterator[tuple[int, TrueImage, Scene]]:
-    """Yield all images with their scenes, and a number that those of one object share, or of one family of parts."""
+def _images(options: Options, model: Model) -> Iterator[tuple[int, TrueImage, Scene, bool]]:
+    """Yield all images with their scenes.
+
+    Also yield a number that those of one object share, or of one family of parts, and whether the network knows it.
+    """
     folders = sorted(path for path in options.bins.glob("*") if (path / SPLIT).is_dir())
     if not folders:
         raise InputError(f"{options.bins} holds no datasets: python -m experiments.build_data validation-bins")
     for number, folder in enumerate(folders, start=1):
         for image in tqdm(bin_images(folder, SPLIT, model, options.every), unit="image", desc=folder.name):
-            yield 1000 * number + image.key.scene_id, image, image.scene
-    if options.worlds is not None:
-        for found in tqdm(world_images(options.worlds, model), unit="image", desc="worlds"):
+            yield 1000 * number + image.key.scene_id, image, image.scene, False
+    for number, world in enumerate((options.worlds, options.known_worlds)):
+        for found in (
+            () if world is None else tqdm(world_images(world, model), unit="image", desc=f"worlds {world.name}")
+        ):
             with suppress(InputError):  # a scan without foreground, as of an empty table
-                yield found.kind, found, make_scene(found.scan, found.part.diameter)
+                scene = make_scene(found.scan, found.part.diameter)
+                yield _KINDS * number + found.kind, found, scene, number == 1
 
 
-def _refined(search: Search, chooser: Calibration, config: SearchConfig) -> Candidates | None:
-    """Return the refined forms of what a model chooses among the poses of a search; None if it chooses nothing."""
-    choice = chosen(search.found, chooser, search.on_device, _LOOSE)
-    rows = np.flatnonzero(choice.kept | choice.contenders)
-    return refined_candidates(search.on_device, search.scene, search.found, rows, 0, config) if len(rows) else None
+def _proposed(search: Search, model: Model, config: SearchConfig, method: str) -> Candidates:
+    """Return the poses in crops around the seeds of a detection's first round."""
+    rows = seeds_over(search.scene, search.scene.foreground, search.image.part)
+    if method == "FPFH":
+        return fpfh_poses(search.part, search.on_device, search.scene, rows)
+    return search_at(model, search.on_device, search.scene, rows, 0, config)
+
+
+def _with_poses(found: Candidates) -> Candidates:
+    """Return the candidates of those crops that have any, or of the first: what the network says of crops is large."""
+    crops = np.unique(found.crop[found.usable]) if found.usable.any() else np.arange(1)
+    rows = np.isin(found.crop, crops)
+    return Candidates(
+        found.T_camera_object[rows],
+        found.usable[rows],
+        found.evidence[rows],
+        found.num_inliers[rows],
+        np.searchsorted(crops, found.crop[rows]),
+        jax.tree.map(lambda leaf: np.asarray(leaf)[crops], found.found),
+        found.seed_rows[crops],
+    )
+
+
+def _without_crops(found: Candidates) -> Candidates:
+    """Return candidates that can be chosen among, but not refined."""
+    return found._replace(found=jax.tree.map(lambda leaf: leaf[:0], found.found))
 
 
 def held_out_models(
@@ -194,7 +226,9 @@ def fit(poses: dict[str, np.ndarray], options: Options) -> tuple[Calibration, di
     judged = np.ones_like(right)
     if poses["reported"].any():
         judged = poses["reported"]
-        scale = fit_calibration(held_out[judged, None], right[judged], ("logit",), hidden_units=0)
+        scale = fit_calibration(held_out[judged, None], right[judged], ("logit",), hidden_units=0, ridge=_SCALE_RIDGE)
+        if scale.weights[0] <= 0:
+            raise InputError("poses are right no more often where models of other objects say so: give more bins")
         model, held_out = model.scaled(scale.weights[0], scale.bias), scale.weights[0] * held_out + scale.bias
     probability, right, there = 1 / (1 + np.exp(-held_out[judged])), right[judged], there[judged]
     accepted = probability >= DetectConfig().accepted
@@ -211,19 +245,28 @@ def fit(poses: dict[str, np.ndarray], options: Options) -> tuple[Calibration, di
     return model, {"summary": summary, "reliability": reliability_table(probability, right)}
 
 
+def _made_of(options: Options, model: Model) -> str:
+    """Say what candidates are made of."""
+    folders = [str(folder) for folder in (options.bins, options.worlds, options.known_worlds)]
+    settings = DetectConfig().search_of(model.config)
+    return repr((options.method, folders, options.every, model_digest(model), EVIDENCE, settings))
+
+
 def calibrate(options: Options) -> dict[str, Any]:
     """Fit, write and print. Raises InputError if there is nothing to fit to."""
     for target in (options.json, options.picture):
         check_target(target)
+    network = load_pretrained() if options.model is None else load_model(options.model)
+    made_of = _made_of(options, network)
     if options.candidates is not None and options.candidates.exists():
         with np.load(options.candidates) as stored:
             poses = dict(stored)
-        if poses["evidence"].shape[1] != len(EVIDENCE):
-            raise InputError(f"{options.candidates} holds other evidence than is gathered now: remove it")
+        if str(poses.pop("made_of", "")) != made_of:
+            raise InputError(f"{options.candidates} holds poses of other bins, weights or settings: remove it")
     else:
-        poses = collect(options)
+        poses = collect(options, network)
         if options.candidates is not None:
-            np.savez(options.candidates, allow_pickle=False, **poses)
+            np.savez(options.candidates, allow_pickle=False, made_of=np.array(made_of), **poses)
     models, results = [], {}
     for name, own in (("found", ~poses["refined"]), ("refined", poses["refined"])):
         model, results[name] = fit({column: values[own] for column, values in poses.items()}, options)

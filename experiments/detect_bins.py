@@ -127,20 +127,25 @@ class Tally:
         states = [(WRONG,) * len(THRESHOLDS)] * count
         return cls(probability, wrong, list(wrong), offsets=[_NOWHERE] * count, states=states)
 
+    def recall_at(self, precision: float) -> float:
+        """Return the recall of poses down to the probability from which on such a share of them is right."""
+        right, hit = np.array(self.right, dtype=bool), np.array(self.hit, dtype=bool)
+        order = np.argsort(-np.array(self.probability), kind="stable")
+        precise = np.flatnonzero(np.cumsum(right[order]) >= precision * np.arange(1, len(order) + 1))
+        most = hit[order[: precise[-1] + 1]].sum() if len(precise) else 0
+        return float(most) / max(self.copies, 1)
+
     def row(self, name: str, method: str, accepted: float) -> dict[str, Any]:
         """Return the numbers."""
         probability, right = np.array(self.probability), np.array(self.right, dtype=bool)
         chosen, hit = probability >= accepted, np.array(self.hit, dtype=bool)
-        order = np.argsort(-probability, kind="stable")
-        precise = np.flatnonzero(np.cumsum(right[order]) >= PRECISION * np.arange(1, len(order) + 1))
-        most = hit[order[: precise[-1] + 1]].sum() if len(precise) else 0
         return {
             "bins": name,
             "method": method,
             "images": len(self.seconds),
             "copies": self.copies,
             "recall": float(hit[chosen].sum()) / max(self.copies, 1),
-            f"recall at precision {PRECISION}": float(most) / max(self.copies, 1),
+            f"recall at precision {PRECISION}": self.recall_at(PRECISION),
             "accepted": int(chosen.sum()),
             "precision": float(right[chosen].mean()) if chosen.any() else None,
             "calibration error": expected_calibration_error(probability, right),

@@ -1,9 +1,10 @@
 """World bins: scenes of many kinds under physics, to fit probabilities on and to test on, as BOP datasets.
 
-Validation and test differ in random seeds, in the families of parts (`experiments.parametric_parts`) and in the ranges
-of containers. Each family of worlds is one scene of the dataset, `worlds.json` names them; of each scene's images some
-show no copy of the part that is asked for, but other parts or nothing. `test_targets_bop19.json` says which part is
-asked for in which image, with the number of its copies; other parts have no entries in scene_gt.json.
+Training (of parts that the network was trained with), validation and test differ in random seeds and in the
+families of parts (`experiments.parametric_parts`), the test also in the ranges of containers. Each family of worlds is
+one scene of the dataset, `worlds.json` names them; of each scene's images some show no copy of the part that is asked
+for, but other parts or nothing. `test_targets_bop19.json` says which part is asked for in which image, with the number
+of its copies; other parts have no entries in scene_gt.json.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 
 from experiments.parametric_parts import TEST_FAMILIES, VALIDATION_FAMILIES, write_parts
 from experiments.test_sets import SPLIT, claim, metric_model, write_scenes
+from experiments.training_parts import PARTS_SEED, TRAINING_FAMILIES
 from kmn_jax.bop import (
     BopFrame,
     dataset_digest,
@@ -107,6 +109,8 @@ class Recipe:
     families: tuple[Family, ...] = FAMILIES  # one scene each
 
 
+# Of parts that the network was trained with (`build_data surfels`): the fit of probabilities wants many kinds.
+TRAINING = Recipe(PARTS_SEED, tuple(TRAINING_FAMILIES), 1.0, images=24)
 VALIDATION = Recipe(11, VALIDATION_FAMILIES, 1.0, parts_a_family=4, images=16)
 TEST = Recipe(12, TEST_FAMILIES, 1.15)
 

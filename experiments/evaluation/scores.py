@@ -63,14 +63,14 @@ class Cell:
         """Return by how much recall is higher than another method's on the same crops, with its 95% interval.
 
         Crops of one scan may go wrong together: the interval is that of sums over scans, which are independent
-        (cluster-robust, normal).
+        (cluster-robust, normal). Of a single scan nothing can be said.
         """
         apart = self._right(gate).astype(float) - other._right(gate)
-        if not len(apart):
-            return 0.0, -1.0, 1.0
-        _, scan = np.unique(self.scenes, return_inverse=True)
+        scans, scan = np.unique(self.scenes, return_inverse=True)
+        if len(scans) < 2:
+            return float(apart.mean()) if len(apart) else 0.0, -1.0, 1.0
         sums = np.bincount(scan, apart - apart.mean())
-        half = _Z * float(np.sqrt((sums**2).sum() * len(sums) / max(len(sums) - 1, 1))) / len(apart)
+        half = _Z * float(np.sqrt((sums**2).sum() * len(sums) / (len(sums) - 1))) / len(apart)
         return float(apart.mean()), float(apart.mean()) - half, float(apart.mean()) + half
 
     def _right(self, gate: str) -> np.ndarray:

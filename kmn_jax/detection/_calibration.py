@@ -20,8 +20,8 @@ from jaxtyping import Array, Bool, Float
 from kmn_jax.errors import InputError, shown
 from kmn_jax.limits import parse_json
 
-_RIDGE = 1e-2  # on standardised weights: that which predicts kinds of objects best that were not fitted to
-_HIDDEN = 8
+_RIDGE = 1e-3  # on standardised weights: that which predicts kinds of objects best that were not fitted to
+_HIDDEN = 24  # as many, for the same reason
 _EXTREME = 1.0  # percent of the poses on either side, beyond which evidence counts as no more extreme
 _ITERATIONS = 500
 

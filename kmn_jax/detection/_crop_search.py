@@ -59,7 +59,7 @@ class CropSearchConfig:
 
     num_draws: int = 4  # of points that the network sees, at most
     enough: float | None = 0.7  # of a pose's surface score, -1 to 3: then no more draws are made; None: all are made
-    give_up: bool = False  # make no more draws where the first one has no pose: a few copies fewer for far less time
+    give_up: bool = False  # no more draws where the first one has no pose: a few copies fewer, in turn far less time
     side_by_side: bool | None = None  # all draws at once; None: unless JAX runs on a CPU
     num_modes: int = 4  # poses of each draw that are compared with the surface
     num_poses: int = 3  # that are refined and returned: the best ones that differ

@@ -32,6 +32,9 @@ _STEP_SEEN, _STEP = 0.04, 0.08  # of depth between neighbouring cells, for an ed
 _ALIKE, _TURNED = 0.85, 0.5
 _PLANE, _PLANE_ALIKE = 0.015, 0.9  # of what lies in one plane
 _REACH = 3  # cells over which a plane is fitted
+_BELOW, _RAISED = 0.02, 0.5  # the plane around an object: so far below it is all below, so high at most counts
+_UNTILTED = 0.01  # square cells, added to how the outline spreads: cells in a row tell no tilt across
+_FLATTEST = 1e-3  # of the nearest point's closeness: a plane is no farther than its inverse tells
 _HIGHEST = jax.lax.Precision.HIGHEST
 
 
@@ -64,6 +67,11 @@ class PictureAgreement(NamedTuple):
     fronted: Scalar  # something in front was measured
     coplanar: Scalar  # the measured surface goes on in one plane
     free_level: Scalar  # of the outline that nothing in front hides: the measured surface goes on
+    buried: (
+        Scalar  # of the object's whole surface: what is below the plane of what surrounds it, as nothing on a floor;
+    )
+    # by less than 2% of the diameter it counts in part
+    raised: Scalar  # mean height of that surface above the plane, seen from the camera, at most half a diameter
 
 
 class _Predicted(NamedTuple):
@@ -135,7 +143,7 @@ def picture_agreement(T_camera_object: Pose, surfels: Surfels, image: DepthImage
         log_area=jnp.log(near.sum(dtype=jnp.float32) * (seen.pitch * seen.nearest / diameter) ** 2 + 1e-4),
         edges=share(measured_step > _STEP_SEEN, edges),
         strange_edges=share((measured_step > _STEP) & (predicted_step < _STEP_SEEN), inside),
-        **_outline(seen, found, compared, diameter),
+        **_outline(seen, found, compared, transform_points(T_camera_object, surfels.points), diameter),
     )
 
 
@@ -205,8 +213,37 @@ def _slope(
     return ways[0] + ways[1], known[0] | known[1]
 
 
-def _outline(seen: _Predicted, found: _Measured, compared: Bool[Array, "s s"], diameter: Scalar) -> dict[str, Scalar]:
-    """Return how the measured surface goes on beyond the outline."""
+def _surroundings(
+    seen: _Predicted, found: _Measured, around: Bool[Array, "s s"], surface: Float[Array, "m 3"], diameter: Scalar
+) -> dict[str, Scalar]:
+    """Return how an object's whole surface lies to the plane of what is measured around it; in it if nothing is."""
+    weight = around.astype(jnp.float32).reshape(-1)
+    total = jnp.maximum(weight.sum(), 1)
+
+    def mean(values: Float[Array, " c"]) -> Scalar:
+        return (weight * values).sum() / total
+
+    # Over directions, the inverse depths of a plane are linear. Directions are taken from the middle, in cells.
+    u, v, closeness = (x.reshape(-1) for x in (seen.u, seen.v, seen.nearest / jnp.where(around, found.depth, 1)))
+    middle_u, middle_v, level = mean(u), mean(v), mean(closeness)
+    x, y, rise = (u - middle_u) / seen.pitch, (v - middle_v) / seen.pitch, closeness - level
+    xx, xy, yy = mean(x * x) + _UNTILTED, mean(x * y), mean(y * y) + _UNTILTED
+    along_x, along_y = mean(x * rise), mean(y * rise)
+    tilt_x, tilt_y = yy * along_x - xy * along_y, xx * along_y - xy * along_x
+    z = jnp.maximum(surface[:, 2], 1e-6 * diameter)
+    x, y = (surface[:, 0] / z - middle_u) / seen.pitch, (surface[:, 1] / z - middle_v) / seen.pitch
+    plane = seen.nearest / jnp.maximum(level + (tilt_x * x + tilt_y * y) / (xx * yy - xy**2), _FLATTEST)
+    height = jnp.where(around.any(), (plane - z) / diameter, 0)
+    return {
+        "buried": jnp.clip(-height / _BELOW, 0, 1).mean(),
+        "raised": jnp.clip(height, -_RAISED, _RAISED).mean(),
+    }
+
+
+def _outline(
+    seen: _Predicted, found: _Measured, compared: Bool[Array, "s s"], surface: Float[Array, "m 3"], diameter: Scalar
+) -> dict[str, Scalar]:
+    """Return how the measured surface goes on beyond the outline, and how the object's lies to it."""
     edge = _grown(seen.mask)
     outline = _grown(edge) & ~edge & found.in_image
     # Of cells without depth, the farthest of those around, twice.
@@ -238,6 +275,7 @@ def _outline(seen: _Predicted, found: _Measured, compared: Bool[Array, "s s"], d
         "fronted": share(fronted),
         "coplanar": share(coplanar),
         "free_level": share(level, outline & ~fronted),
+        **_surroundings(seen, found, there & ~fronted, surface, diameter),
     }
 
 

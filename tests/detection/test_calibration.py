@@ -58,7 +58,7 @@ def test_hidden_units_learn_what_depends_on_another_number() -> None:
     rng = np.random.default_rng(1)
     evidence = rng.uniform(-1, 1, (3_000, 2)).astype(np.float32)
     right = evidence.prod(axis=1) > 0
-    plain, hidden = (fit_calibration(evidence, right, ("a", "b"), hidden_units=units) for units in (0, 8))
+    plain, hidden = (fit_calibration(evidence, right, ("a", "b"), hidden_units=units) for units in (0, 24))
     assert ((plain.probability(evidence) > 0.5) == right).mean() < 0.7
     assert ((hidden.probability(evidence) > 0.5) == right).mean() > 0.9
     assert fit_calibration(evidence, right, ("a", "b")) == hidden

@@ -15,7 +15,7 @@ from tests.reference.meshes import pose
 
 PART = box_part()
 SURFELS = Surfels(jnp.asarray(PART.points), jnp.asarray(PART.normals), jnp.float32(PART.area))
-NO_SHARES = ("offset", "log_cells", "log_area", "deviation", "noise")
+NO_SHARES = ("offset", "log_cells", "log_area", "deviation", "noise", "raised")
 compare = jax.jit(picture_agreement)
 
 
@@ -49,6 +49,31 @@ def test_a_wall_goes_on_beyond_a_box_sunk_into_it(depth: jax.Array) -> None:
     found = of(pose((0.0, 0.0, WALL + SIZES[2] / 2)), jnp.full_like(depth, WALL))
     assert found.level > 0.95
     assert found.open == 0
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.3, -0.2), (-0.5, 0.1)])
+def test_a_box_on_a_floor_is_above_it_and_one_in_it_is_buried(depth: jax.Array, tilt: tuple[float, float]) -> None:
+    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
+    x, y = (columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy
+    floor = jnp.asarray(WALL / (1 - tilt[0] * x - tilt[1] * y), dtype=jnp.float32)
+    down = np.array([-tilt[0], -tilt[1], 1.0]) / np.linalg.norm([*tilt, 1.0])
+    along = np.cross([0.0, 1.0, 0.0], down)
+    along /= np.linalg.norm(along)
+    lying, flush = np.eye(4), np.eye(4)
+    for T, way in ((lying, -0.5), (flush, 0.5)):
+        T[:3, :3] = np.stack([along, np.cross(down, along), down], axis=1)
+        T[:3, 3] = np.array([0.0, 0.0, WALL]) + way * SIZES[2] * down
+    above, below = of(lying, floor), of(flush, floor)
+    assert above.buried < 0.01
+    assert below.buried > 0.6  # all but the front and the upper edges of the sides
+    height = SIZES[2] / 2 / down[2] / PART.diameter  # of the middle, along the line of sight
+    np.testing.assert_allclose([above.raised, below.raised], [height, -height], atol=0.02)
+
+
+def test_without_surroundings_nothing_is_buried(depth: jax.Array) -> None:
+    for nothing in (jnp.zeros_like(depth), jnp.full_like(depth, 1.0)):  # not measured, or hidden
+        found = of(POSES[0], nothing)
+        assert (found.buried, found.raised) == (0, 0)
 
 
 def test_a_pose_half_on_a_box_is_open_there_only(depth: jax.Array) -> None:

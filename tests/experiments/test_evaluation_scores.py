@@ -148,6 +148,8 @@ def test_paired_differences_take_scans_as_independent() -> None:
     apart = replace(other, errors=lost, scenes=np.arange(100).astype(str))
     assert apart.ahead_of(own)[2] - apart.ahead_of(own)[1] < 1.5 * spread
     assert own.ahead_of(own) == (0.0, 0.0, 0.0)
+    single = np.zeros(len(own.errors), dtype=int)
+    assert replace(own, scenes=single).ahead_of(replace(other, errors=lost, scenes=single)) == (ahead, -1.0, 1.0)
     cells = [own, replace(other, errors=lost)] + [replace(one, noise=0.05) for one in (own, other)]
     (row,) = paired_rows(cells, "kmn_jax + ICP")
     assert row["method"] == "FPFH"
