@@ -234,7 +234,7 @@ def fit(poses: dict[str, np.ndarray], options: Options) -> tuple[Calibration, di
     accepted = probability >= DetectConfig().accepted
     present = accepted & there
     summary = {
-        "objects": len(np.unique(poses["object"])),
+        "objects": len(np.unique(poses["object"][judged])),
         "poses": len(right),
         "right": float(right.mean()),
         "expected calibration error": expected_calibration_error(probability, right),
