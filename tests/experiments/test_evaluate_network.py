@@ -110,7 +110,7 @@ def test_the_card_tells_how_exact_poses_are(run: Path, evaluation: Path, tmp_pat
         *("shifted, mm", "shifted, % of the diameter", "turned, degrees"),
         *("MSSD recall", "average precision"),
     ]
-    assert rows[1][4:] == ["0.0042 / 0.341", "0.0156 / 1.16", "0.0218 / 180", "0.63", "0.62"]
+    assert rows[1][4:] == ["0.00466 / 0.727", "0.018 / 2.54", "0.022 / 180", "0.70", "0.64"]
 
 
 def test_a_release_holds_weights_curve_picture_and_card(run: Path, evaluation: Path, tmp_path: Path) -> None:
