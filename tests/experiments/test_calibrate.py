@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
 from experiments import calibrate
 from experiments.calibrate import Options, fit
-from kmn_jax.detection import expected_calibration_error
+from kmn_jax.detection import Candidates, expected_calibration_error
+from kmn_jax.errors import InputError
 
 _OBJECTS, _POSES, _COLUMNS = 10, 60, 12
 
 
-def drawn(random_seed: int, objects: int = _OBJECTS) -> dict[str, np.ndarray]:
+def drawn(random_seed: int, objects: int = _OBJECTS, spread: float = 1.0) -> dict[str, np.ndarray]:
     """Return poses of objects, for each of which evidence is another wherever it is right."""
     rng = np.random.default_rng(random_seed)
     right = rng.random((objects, _POSES)) < 0.3
     strange = rng.normal(size=(objects, 1, _COLUMNS))
-    evidence = right[..., None] + strange + rng.normal(size=(objects, _POSES, _COLUMNS))
+    evidence = right[..., None] + strange + spread * rng.normal(size=(objects, _POSES, _COLUMNS))
     return {
         "evidence": evidence.reshape(-1, _COLUMNS),
         "error": np.where(right, 0.01, np.where(rng.random(right.shape) < 0.3, np.inf, 0.5)).reshape(-1),
@@ -47,9 +51,48 @@ def test_probabilities_hold_for_objects_of_other_kinds() -> None:
 
 
 def test_absent_parts_count_more_among_refined_poses() -> None:
-    poses = drawn(0) | {"reported": np.zeros(_OBJECTS * _POSES, dtype=bool)}  # the scale stays as it is
-    absent, usual = (fit(poses, Options(absent_weight=weight))[0].probability(poses["evidence"]) for weight in (20, 1))
-    assert absent.mean() < 0.8 * usual.mean()
-    found = poses | {"refined": np.zeros(len(poses["error"]), dtype=bool)}
-    absent, usual = (fit(found, Options(absent_weight=weight))[0].probability(poses["evidence"]) for weight in (20, 1))
-    np.testing.assert_array_equal(absent, usual)
+    # The scale stays as it is, and much is in doubt: more poses than the model could learn by heart.
+    poses = drawn(0, 25, spread=6.0) | {"reported": np.zeros(25 * _POSES, dtype=bool)}
+
+    def fitted(poses: dict[str, np.ndarray], weight: float) -> np.ndarray:
+        return fit(poses, Options(absent_weight=weight, folds=2))[0].probability(poses["evidence"])
+
+    assert fitted(poses, 20).mean() < 0.8 * fitted(poses, 1).mean()
+    found = drawn(0) | {"reported": np.zeros(_OBJECTS * _POSES, dtype=bool)}
+    found["refined"] = ~found["refined"]
+    np.testing.assert_array_equal(fitted(found, 20), fitted(found, 1))
+
+
+def test_crops_without_poses_are_dropped_and_the_others_keep_theirs() -> None:
+    usable = np.array([False, False, True, False, False, False, False, True])  # two poses of each of four crops
+    crop = np.repeat(np.arange(4), 2)
+    said: Any = {"logits": np.arange(4)}
+    found = Candidates(
+        np.arange(8)[:, None], usable, np.arange(8)[:, None] * 10, np.arange(8), crop, said, crop[::2] * 7
+    )
+    few = calibrate._with_poses(found)
+    np.testing.assert_array_equal(few.evidence[:, 0], [20, 30, 60, 70])
+    np.testing.assert_array_equal(few.usable, [True, False, False, True])
+    np.testing.assert_array_equal(few.crop, [0, 0, 1, 1])
+    np.testing.assert_array_equal(few.found["logits"], [1, 3])
+    np.testing.assert_array_equal(few.seed_rows, [7, 21])
+    none = calibrate._with_poses(found._replace(usable=np.zeros(8, dtype=bool)))
+    assert (len(none.usable), len(none.seed_rows)) == (2, 1)
+
+
+def test_candidates_of_other_bins_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "candidates.npz"
+    np.savez(path, allow_pickle=False, made_of=np.array("others"), **drawn(0))
+    with pytest.raises(InputError, match="holds poses of other bins, weights or settings: remove it"):
+        calibrate.calibrate(Options(candidates=path, output=tmp_path / "a.json"))
+
+
+def test_where_probable_poses_are_wrong_no_scale_is_fitted() -> None:
+    poses = drawn(0)
+    right = poses["error"] < 0.1
+    # Each object's evidence speaks for the opposite of what all others' does.
+    turned = np.where(poses["object"] % 2 == 0, 1, -1)
+    poses["evidence"] = np.outer(np.where(right, 1.0, -1.0) * turned, np.ones(_COLUMNS))
+    poses["object"] = poses["object"] % 2
+    with pytest.raises(InputError, match="give more bins"):
+        fit(poses, Options(absent_weight=1.0, folds=2))
