@@ -1,12 +1,13 @@
 """Fit the probabilities of detections: `python -m experiments.calibrate [MODEL.safetensors]`.
 
 Poses are searched in the validation bins (`python -m experiments.build_data validation-bins`), whose objects the
-network was not trained with, and with `--worlds` in the whole scans of world bins; in every second one also a part that
-is not there. A small model of the evidence is fitted to whether they are right. Each object's probabilities are also
-predicted by a model that was fitted without it, which gives the reliability that is printed. The model of poses as
-they are found is fitted first: it chooses which of them are refined, here as in detection. Of refined poses detection
-reports one for each place. Models are too sure of themselves about kinds of objects that they were not fitted to: so
-the scale of the refined poses' model is fitted to what detection would report by models that do not know the kind.
+network was not trained with, and with `--worlds` and `--known-worlds` in the whole scans of world bins; in every second
+image also a part that is not there. A small model of the evidence is fitted to whether they are right. Each object's
+probabilities are also predicted by a model that was fitted without it, which gives the reliability that is printed. The
+model of poses as they are found is fitted first: it chooses which of them are refined, here as in detection. Of refined
+poses detection reports one for each place. Models are too sure of themselves about kinds of objects that they were not
+fitted to: so the scale of the refined poses' model is fitted to what detection would report by models that do not know
+the kind.
 """
 
 from __future__ import annotations
@@ -153,9 +154,9 @@ def _images(options: Options, model: Model) -> Iterator[tuple[int, TrueImage, Sc
         for image in tqdm(bin_images(folder, SPLIT, model, options.every), unit="image", desc=folder.name):
             yield 1000 * number + image.key.scene_id, image, image.scene, False
     for number, world in enumerate((options.worlds, options.known_worlds)):
-        for found in (
-            () if world is None else tqdm(world_images(world, model), unit="image", desc=f"worlds {world.name}")
-        ):
+        if world is None:
+            continue
+        for found in tqdm(world_images(world, model), unit="image", desc=f"worlds {world.name}"):
             with suppress(InputError):  # a scan without foreground, as of an empty table
                 scene = make_scene(found.scan, found.part.diameter)
                 yield _KINDS * number + found.kind, found, scene, number == 1

@@ -21,7 +21,7 @@ from kmn_jax.errors import InputError, shown
 from kmn_jax.limits import parse_json
 
 _RIDGE = 1e-3  # on standardised weights: that which predicts kinds of objects best that were not fitted to
-_HIDDEN = 24  # as many, for the same reason
+_HIDDEN = 24  # units: chosen in the same way
 _EXTREME = 1.0  # percent of the poses on either side, beyond which evidence counts as no more extreme
 _ITERATIONS = 500
 

@@ -67,10 +67,7 @@ class PictureAgreement(NamedTuple):
     fronted: Scalar  # something in front was measured
     coplanar: Scalar  # the measured surface goes on in one plane
     free_level: Scalar  # of the outline that nothing in front hides: the measured surface goes on
-    buried: (
-        Scalar  # of the object's whole surface: what is below the plane of what surrounds it, as nothing on a floor;
-    )
-    # by less than 2% of the diameter it counts in part
+    buried: Scalar  # of the whole surface: below the plane of what surrounds it; by less than 2% it counts in part
     raised: Scalar  # mean height of that surface above the plane, seen from the camera, at most half a diameter
 
 
@@ -84,6 +81,7 @@ class _Predicted(NamedTuple):
     v: Float[Array, "s s"]
     pitch: Scalar  # of directions
     nearest: Scalar  # depth of the nearest point
+    surface: Float[Array, "m 3"]  # all of the object's, also what is turned away
 
 
 class _Measured(NamedTuple):
@@ -143,7 +141,7 @@ def picture_agreement(T_camera_object: Pose, surfels: Surfels, image: DepthImage
         log_area=jnp.log(near.sum(dtype=jnp.float32) * (seen.pitch * seen.nearest / diameter) ** 2 + 1e-4),
         edges=share(measured_step > _STEP_SEEN, edges),
         strange_edges=share((measured_step > _STEP) & (predicted_step < _STEP_SEEN), inside),
-        **_outline(seen, found, compared, transform_points(T_camera_object, surfels.points), diameter),
+        **_outline(seen, found, compared, diameter),
     )
 
 
@@ -175,7 +173,7 @@ def _predicted(T_camera_object: Pose, surfels: Surfels, image: DepthImage) -> _P
     steps = (jnp.arange(_SIDE, dtype=jnp.float32) - _SPARE) * pitch
     u, v = jnp.meshgrid(low[0] + steps, low[1] + steps)
     depth = (sums[:, 3] / jnp.maximum(sums[:, 4], 1)).reshape(_SIDE, _SIDE)
-    return _Predicted(mask, depth, (sums[:, :3] / length).reshape(_SIDE, _SIDE, 3), u, v, pitch, nearest)
+    return _Predicted(mask, depth, (sums[:, :3] / length).reshape(_SIDE, _SIDE, 3), u, v, pitch, nearest, points)
 
 
 def _measured(seen: _Predicted, image: DepthImage, diameter: Scalar) -> _Measured:
@@ -214,7 +212,7 @@ def _slope(
 
 
 def _surroundings(
-    seen: _Predicted, found: _Measured, around: Bool[Array, "s s"], surface: Float[Array, "m 3"], diameter: Scalar
+    seen: _Predicted, found: _Measured, around: Bool[Array, "s s"], diameter: Scalar
 ) -> dict[str, Scalar]:
     """Return how an object's whole surface lies to the plane of what is measured around it; in it if nothing is."""
     weight = around.astype(jnp.float32).reshape(-1)
@@ -230,8 +228,8 @@ def _surroundings(
     xx, xy, yy = mean(x * x) + _UNTILTED, mean(x * y), mean(y * y) + _UNTILTED
     along_x, along_y = mean(x * rise), mean(y * rise)
     tilt_x, tilt_y = yy * along_x - xy * along_y, xx * along_y - xy * along_x
-    z = jnp.maximum(surface[:, 2], 1e-6 * diameter)
-    x, y = (surface[:, 0] / z - middle_u) / seen.pitch, (surface[:, 1] / z - middle_v) / seen.pitch
+    z = jnp.maximum(seen.surface[:, 2], 1e-6 * diameter)
+    x, y = (seen.surface[:, 0] / z - middle_u) / seen.pitch, (seen.surface[:, 1] / z - middle_v) / seen.pitch
     plane = seen.nearest / jnp.maximum(level + (tilt_x * x + tilt_y * y) / (xx * yy - xy**2), _FLATTEST)
     height = jnp.where(around.any(), (plane - z) / diameter, 0)
     return {
@@ -240,9 +238,7 @@ def _surroundings(
     }
 
 
-def _outline(
-    seen: _Predicted, found: _Measured, compared: Bool[Array, "s s"], surface: Float[Array, "m 3"], diameter: Scalar
-) -> dict[str, Scalar]:
+def _outline(seen: _Predicted, found: _Measured, compared: Bool[Array, "s s"], diameter: Scalar) -> dict[str, Scalar]:
     """Return how the measured surface goes on beyond the outline, and how the object's lies to it."""
     edge = _grown(seen.mask)
     outline = _grown(edge) & ~edge & found.in_image
@@ -275,7 +271,7 @@ def _outline(
         "fronted": share(fronted),
         "coplanar": share(coplanar),
         "free_level": share(level, outline & ~fronted),
-        **_surroundings(seen, found, there & ~fronted, surface, diameter),
+        **_surroundings(seen, found, there & ~fronted, diameter),
     }
 
 
