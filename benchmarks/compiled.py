@@ -31,7 +31,7 @@ from benchmarks.compiled_hlo import parse_module
 from benchmarks.compiled_programs import Program, programs
 from benchmarks.compiled_targets import TARGETS, Target, devices_of, prepare, seconds, seconds_of
 from benchmarks.compiled_tpu import optimized
-from benchmarks.timing import time_in_turn
+from benchmarks.timing import paused, time_in_turn
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import ask_for_fast_selection
 from kmn_jax.report import print_table, write_json
@@ -46,16 +46,18 @@ def main(
     trips: int = 8,
     texts: Path | None = None,
     measure: bool = False,
+    pause: Path | None = None,
     json: Path | None = None,
 ) -> None:
     """Compile programs and count them.
 
     Args:
-        target: devices to compile for: h200, h200x8, v5e-1, v5e-16, v5e-256 or v6e-8.
+        target: devices to compile for: h100, h200, h200x8, v5e-1, v5e-16, v5e-256 or v6e-8.
         only: parts of the names of programs; without any, all.
         trips: of loops whose length only the data knows.
         texts: folder for compiled programs' texts, from which those that are there already are counted again.
         measure: run them on the device that is there, of which `target` only gives the ceilings.
+        pause: a file with the ids of processes that are stopped while a program is timed, as they use the device, too.
         json: where results go; written after each program.
     """
     if target not in TARGETS:
@@ -75,7 +77,7 @@ def main(
     details: dict[str, Any] = {}
     for program in chosen:
         if measure:
-            text, facts = _compiled(program, devices, True)
+            text, facts = _compiled(program, devices, True, pause)
         else:
             on_tpu = where.platform == "tpu"
             make = partial(optimized, target, program.name) if on_tpu else partial(_compiled, program, devices)
@@ -108,7 +110,9 @@ def _kept(
     return text, facts
 
 
-def _compiled(program: Program, devices: list[Any], measure: bool = False) -> tuple[str, dict[str, Any]]:
+def _compiled(
+    program: Program, devices: list[Any], measure: bool = False, pause: Path | None = None
+) -> tuple[str, dict[str, Any]]:
     """Return the text of a compiled program, its memory and perhaps its time."""
     start = time.perf_counter()
     function, arguments = program.make(devices)
@@ -123,7 +127,8 @@ def _compiled(program: Program, devices: list[Any], measure: bool = False) -> tu
         "argument MB": memory.argument_size_in_bytes / 1e6,
     }
     if measure:
-        facts |= _measured(compiled, arguments, program.goes_on)
+        with paused(pause):
+            facts |= _measured(compiled, arguments, program.goes_on)
     return compiled.as_text(), facts
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jax.sharding import NamedSharding, PartitionSpec
 
-from benchmarks.stages import SEARCH, small_case
+from benchmarks.stages import SEARCH
 from configs import find_config
 from kmn_jax.data import Pack, SampleIndex, stack_pack
 from kmn_jax.detection import (
@@ -19,21 +19,24 @@ from kmn_jax.detection import (
     BinPosesConfig,
     CalibrationArrays,
     DepthImage,
+    DevicePart,
     bin_poses,
-    device_part,
     poses_in_crop,
     search_crop,
 )
 from kmn_jax.geometry import Intrinsics, PaddedCloud
-from kmn_jax.models import RELEASED_CONFIG, Compute, load_pretrained, model_structure
-from kmn_jax.objects import arrays_of, make_part
+from kmn_jax.models import RELEASED_CONFIG, Compute, KeyMatchNetConfig, load_pretrained, model_structure
+from kmn_jax.objects import PartArrays
+from kmn_jax.simulate import Surfels
 from kmn_jax.train import create_state, data_mesh, jit_train_step
 
 _PACK = "experiments/assets/small_pack"
 _OBJECTS = 1507  # of the training pack, of which the small one has a few
 _CLOUD = 32_768  # points of a scan
 _IMAGE = (600, 972)  # pixels of the small test set's images
-_HIDDEN_UNITS = 8  # of the model of probabilities
+_SURFELS = 2048  # of an object on the device
+_SYMMETRIES, _LOOK_ALIKES = 1, 24
+_HIDDEN_UNITS = 24  # of the model of probabilities
 COMPUTES: tuple[Compute, ...] = ("float32", "tf32", "bfloat16")
 
 
@@ -61,6 +64,7 @@ def programs(devices: int) -> list[Program]:
 
 def _steps() -> Iterator[tuple[str, Compute, int]]:
     yield "small", "float32", 64
+    yield "worlds_long", "float32", 128
     yield "paper", "float32", 14
     yield "paper", "bfloat16", 14
     for compute in COMPUTES:
@@ -93,7 +97,7 @@ def _crops(batch: int) -> Program:
 
     def make(devices: list[Any]) -> tuple[Any, tuple[Any, ...]]:
         model = load_pretrained("small")
-        part = arrays_of(model, make_part(small_case()[0], model))
+        part = _part(model.config)
         config = replace(SEARCH.of_network(model.config), side_by_side=True)  # what a device would have it be
 
         def solve(parameters: nnx.State, part: Any, clouds: PaddedCloud, keys: jax.Array) -> Any:
@@ -116,7 +120,10 @@ def _bin(seeds: int) -> Program:
 
     def make(devices: list[Any]) -> tuple[Any, tuple[Any, ...]]:
         model = load_pretrained("small")
-        part = device_part(model, make_part(small_case()[0], model))
+        surfels = Surfels(*[_array((_SURFELS, 3), jnp.float32)] * 2, _array((), jnp.float32))
+        poses = _array((_SYMMETRIES, 4, 4), jnp.float32)
+        rivals = _array((_LOOK_ALIKES, 4, 4), jnp.float32), _array((_LOOK_ALIKES,), jnp.bool_)
+        part = DevicePart(_part(model.config), surfels, poses, _array((), jnp.float32), *rivals)
         search = BinPosesConfig().search
         search = replace(search, crops=replace(search.crops.of_network(model.config), side_by_side=True))
         config = BinPosesConfig(num_seeds=seeds, search=search)
@@ -136,6 +143,13 @@ def _bin(seeds: int) -> Program:
     return Program(f"bin in one call, {seeds} seeds, small", 1, "bin", make)
 
 
+def _part(config: KeyMatchNetConfig) -> PartArrays:
+    """Return the shapes of an encoded object."""
+    points = _array((config.num_object_points, 3), jnp.float32)
+    features = _array((config.num_keypoints, config.object_width), jnp.float32)
+    return PartArrays(points, points, features, _array((), jnp.float32))
+
+
 def _step(name: str, compute: Compute, batch: int, devices: int) -> Program:
     """A training step with its data, sharded over all devices."""
 
@@ -150,7 +164,8 @@ def _step(name: str, compute: Compute, batch: int, devices: int) -> Program:
         mesh = data_mesh(devices)
         whole, shared = (NamedSharding(mesh, PartitionSpec(*axes)) for axes in ((), mesh.axis_names))
         graphdef, state = create_state(config.step, config.optimizer.build(config.num_steps))
-        pack = stack_pack(Pack(_PACK), "train", config.examples.visibility == "bits").arrays
+        scenes = config.examples.worlds is None
+        pack = stack_pack(Pack(_PACK), "train", config.examples.visibility == "bits", scenes).arrays
         pack = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((_OBJECTS, *leaf.shape[1:]), leaf.dtype), pack)
         index, key = _array((batch,), jnp.int32), _array((batch, 2), jnp.uint32)
         samples = SampleIndex(index, index, key, _array((batch,), jnp.bool_))

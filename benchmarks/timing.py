@@ -9,9 +9,13 @@ shown.
 
 from __future__ import annotations
 
+import os
+import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -87,6 +91,25 @@ def time_in_turn(
         name: Steady(float(np.median(t)), float(np.min(t)), float(np.percentile(t, 90)), len(t))
         for name, t in times.items()
     }
+
+
+@contextmanager
+def paused(path: Path | None) -> Iterator[None]:
+    """Stop the processes whose ids a file holds, and let them go on afterwards; those that have ended are passed over."""
+    ids = [int(word) for word in path.read_text().split()] if path else []
+
+    def send(number: int) -> None:
+        for each in ids:
+            with suppress(ProcessLookupError):
+                os.kill(each, number)
+
+    send(signal.SIGSTOP)
+    try:
+        if ids:
+            time.sleep(0.3)  # what they have sent to the device ends
+        yield
+    finally:
+        send(signal.SIGCONT)
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import difflib
 
-from configs.base import base
+from configs.base import base, base_worlds
 from configs.debug import debug
 from configs.normalization import normalization_metric, normalization_released
 from configs.paper import paper, paper_tenth
 from configs.per_object import per_object
-from configs.small import small, worlds
+from configs.small import small, worlds, worlds_long
+from configs.variants import VARIANTS
 from kmn_jax.errors import InputError
 from kmn_jax.train._config import TrainConfig
 
@@ -19,8 +20,11 @@ CONFIGS: dict[str, TrainConfig] = {
         paper,
         paper_tenth,
         base,
+        base_worlds,
         small,
         worlds,
+        worlds_long,
+        *VARIANTS,
         per_object,
         normalization_metric,
         normalization_released,

@@ -11,6 +11,9 @@ base
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from configs.small import worlds
 from kmn_jax.data import PipelineConfig
 from kmn_jax.models import KeyMatchNetConfig
 from kmn_jax.train import OptimizerConfig, TrainConfig
@@ -31,4 +34,18 @@ base = TrainConfig(
     ),
     pipeline=PipelineConfig(batch_size=128, crops_per_object=4),
     average_decay=0.999,
+)
+
+base_worlds = replace(
+    base,
+    name="base_worlds",
+    pack=worlds.pack,
+    num_steps=1_000,
+    network=replace(base.network, inputs="chiral", num_keypoints=64),
+    examples=replace(worlds.examples, crops=replace(worlds.examples.crops, num_points=2_048)),
+    optimizer=replace(base.optimizer, warmup_steps=100),
+    average_decay=0.99,
+    validation_samples=20,
+    checkpoint_every=500,
+    log_every=50,
 )

@@ -81,3 +81,15 @@ worlds = replace(
     ),
     optimizer=replace(small.optimizer, learning_rate=2e-2),
 )
+
+worlds_long = replace(
+    worlds,
+    name="worlds_long",
+    num_steps=10_000,
+    network=replace(worlds.network, num_scene_points=1_024),
+    examples=replace(worlds.examples, crops=replace(worlds.examples.crops, num_points=1_024)),
+    pipeline=replace(worlds.pipeline, batch_size=128),
+    crops_at_once=None,
+    validate_every=2_000,
+    checkpoint_every=1_000,
+)

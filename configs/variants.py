@@ -1,0 +1,44 @@
+"""Networks beside `small`, all trained alike: from random parameters, in worlds, with as many samples.
+
+variant_reference is `small` itself; every other one differs from it by what its name says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from configs.small import worlds
+from kmn_jax.models import KeyMatchNetConfig
+from kmn_jax.train import TrainConfig
+
+
+def _variant(name: str, **changes: object) -> TrainConfig:
+    network: KeyMatchNetConfig = replace(worlds.network, **changes)  # type: ignore[arg-type]
+    crops = replace(worlds.examples.crops, num_points=network.num_scene_points)
+    return replace(
+        worlds,
+        name=f"variant_{name}",
+        warm_start=None,
+        num_steps=1_000,
+        network=network,
+        examples=replace(worlds.examples, crops=crops),
+        optimizer=replace(worlds.optimizer, learning_rate=3e-2, warmup_steps=100),
+        pipeline=replace(worlds.pipeline, batch_size=128),
+        crops_at_once=None,
+        average_decay=0.99,
+        checkpoint_every=1_000,
+    )
+
+
+VARIANTS = (
+    _variant("reference"),
+    _variant("points_1024", num_scene_points=1_024),
+    _variant("wide", edge_width=64, embedding_width=1_024, scene_width=512, object_width=128, pair_width=256),
+    _variant("dynamic", graph="dynamic"),
+    _variant("keypoints_20", num_keypoints=20),
+    _variant("keypoints_128", num_keypoints=128),
+    _variant("keypoints_512", num_keypoints=512),
+    _variant("neighbors_20", num_neighbors=20),
+    _variant("invariant", inputs="invariant"),
+    _variant("narrow", edge_width=16, embedding_width=256, scene_width=128, object_width=32, pair_width=64),
+)
