@@ -95,13 +95,13 @@ def time_in_turn(
 
 @contextmanager
 def paused(path: Path | None) -> Iterator[None]:
-    """Stop the processes whose ids a file holds, and let them go on afterwards; those that have ended are passed over."""
+    """Stop the processes whose ids a file holds, and let them go on afterwards, those that have not ended."""
     ids = [int(word) for word in path.read_text().split()] if path else []
 
     def send(number: int) -> None:
-        for each in ids:
+        for process in ids:
             with suppress(ProcessLookupError):
-                os.kill(each, number)
+                os.kill(process, number)
 
     send(signal.SIGSTOP)
     try:
