@@ -120,7 +120,8 @@ def _bin(seeds: int) -> Program:
 
     def make(devices: list[Any]) -> tuple[Any, tuple[Any, ...]]:
         model = load_pretrained("small")
-        surfels = Surfels(*[_array((_SURFELS, 3), jnp.float32)] * 2, _array((), jnp.float32))
+        points = _array((_SURFELS, 3), jnp.float32)
+        surfels = Surfels(points, points, _array((), jnp.float32))
         poses = _array((_SYMMETRIES, 4, 4), jnp.float32)
         rivals = _array((_LOOK_ALIKES, 4, 4), jnp.float32), _array((_LOOK_ALIKES,), jnp.bool_)
         part = DevicePart(_part(model.config), surfels, poses, _array((), jnp.float32), *rivals)
