@@ -219,8 +219,8 @@ class _Run:
             batch = put_batch(samples, self.mesh)
             self.state, metrics = self.train_step(self.state, self.training.pack, batch, number)
             vote = any_process(bool(self.stop.reason), self.mesh)
-            for array in jax.tree.leaves(metrics):
-                array.copy_to_host_async()
+        for array in jax.tree.leaves(metrics):
+            array.copy_to_host_async()
         self.pending.append(_Pending(self.step, index_of(samples), state, metrics, vote))
         self.step += 1
         self._settle(_AHEAD)
