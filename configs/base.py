@@ -7,6 +7,13 @@ base
     Command:   python -m experiments.train base
     Hardware:  one GPU of 80 GB or more. Not yet run.
     Expected:  not yet known.
+
+base_worlds
+    Beside the variants of `configs/variants.py`, with as many samples.
+    Command:   python -m experiments.train base_worlds
+    Hardware:  one GPU. Not yet run: on an H200 its first step failed with 128 samples at once (jax 0.11.2: "select_k:
+               scratch capacity exceeded"), hence 64 here, which have not been tried.
+    Expected:  not yet known.
 """
 
 from __future__ import annotations
@@ -33,6 +40,7 @@ base = TrainConfig(
         clip_norm=1.0,
     ),
     pipeline=PipelineConfig(batch_size=128, crops_per_object=4),
+    crops_at_once=64,
     average_decay=0.999,
 )
 
