@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -176,10 +176,15 @@ def reliability(
 
 @dataclass(frozen=True)
 class Probabilities:
-    """The model of poses as they are found, which chooses among them, and that of refined ones, which is reported."""
+    """The model of poses as they are found, which chooses among them, and that of refined ones, which is reported.
+
+    `exact` is of refined poses that are right in all of their points, not on average: it tells poses of one place apart
+    that are turned against each other.
+    """
 
     found: Calibration
     refined: Calibration
+    exact: Calibration
 
 
 def probabilities_bytes(probabilities: Probabilities) -> bytes:
@@ -191,7 +196,7 @@ def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
     """Read models of the evidence with the given names. Raises InputError if the file holds anything else."""
     try:
         stored = parse_json(Path(path).read_text(encoding="utf-8"))
-        models = [_read(found) for found in (stored["found"], stored["refined"])]
+        models = [_read(stored[field.name]) for field in fields(Probabilities)]
     except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path} is not a readable calibration: {shown(error)}") from None
     if any(model.names != tuple(names) for model in models):

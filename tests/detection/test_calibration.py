@@ -97,7 +97,8 @@ def test_reliability_counts_every_pose_once() -> None:
 
 def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.calibration.json"
-    fitted = Probabilities(Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25), fit_calibration(*drawn(100), NAMES))
+    logistic = Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25)
+    fitted = Probabilities(logistic, fit_calibration(*drawn(100), NAMES), logistic)
     path.write_bytes(probabilities_bytes(fitted))
     assert load_probabilities(path, NAMES) == fitted
     with pytest.raises(InputError, match="of other evidence"):
@@ -106,7 +107,7 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
         "",
         "[]",
         "{}",
-        '{"found": 1, "refined": {"names": ["first"], "weights": ["x"], "bias": 0}}',
+        '{"found": 1, "refined": {"names": ["first"], "weights": ["x"], "bias": 0}, "exact": 1}',
         _damaged(fitted),
         probabilities_bytes(fitted).decode().replace("-2.5", f"1{'0' * 400}"),
     ):
