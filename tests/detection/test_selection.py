@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -11,7 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.detection import Calibration, DetectConfig, DevicePart, Selection, same_place, select, symmetry_transforms
+from kmn_jax.detection import (
+    Calibration,
+    Candidates,
+    DetectConfig,
+    DevicePart,
+    Selection,
+    same_place,
+    select,
+    symmetry_transforms,
+)
 from kmn_jax.detection import chosen as choose_candidates
 from kmn_jax.detection._selection import _greedy, overlap
 from kmn_jax.objects import Part, PartArrays, Symmetries
@@ -152,11 +160,10 @@ def test_of_turned_poses_in_one_place_the_exact_one_stands() -> None:
     turned = moved(0, 0, 0, rotation_about(Z, np.pi / 2))
     names = ("on average", "everywhere")
     average, exact = Calibration(names, (1.0, 0.0), 2.0), Calibration(names, (0.0, 1.0), 0.0)
-    found: Any = SimpleNamespace(
-        T_camera_object=np.stack([np.eye(4, dtype=np.float32), turned.astype(np.float32)]),
-        usable=np.ones(2, dtype=bool),
-        evidence=np.array([[1.0, 2.0], [1.1, -2.0]]),
-    )
+    poses, evidence = np.stack([np.eye(4), turned]).astype(np.float32), np.array([[1.0, 2.0], [1.1, -2.0]])
+    nothing: Any = None  # what the network says of crops
+    count, crop = np.zeros(2, dtype=np.int32), np.zeros(2, dtype=np.int64)
+    found = Candidates(poses, np.ones(2, dtype=bool), evidence, count, crop, nothing, crop[:1])
     part, config = on_device(BOX), DetectConfig()
     assert choose_candidates(found, average, part, config).kept.tolist() == [False, True]
     by_exact = choose_candidates(found, average, part, config, exact)
