@@ -72,6 +72,7 @@ class Options:
     known_worlds: Path | None = None  # the same, of parts that the network was trained with: no scale is fitted to it
     every: int = 1  # use every so many images of `bins`
     folds: int = 5
+    members: int = 5  # fits, whose mean is the model of refined poses
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
     output: Path = SHIPPED  # the calibration
     candidates: Path | None = None  # .npz file to write the candidates to, or to read them from if it exists
@@ -219,7 +220,9 @@ def held_out_models(
 
 
 def _model(poses: dict[str, np.ndarray], options: Options) -> Calibration:
-    return fit_calibration(poses["evidence"], poses["error"] < THRESHOLD, EVIDENCE, _weights(poses, options))
+    members = options.members if poses["refined"].all() else 1  # one is enough to choose what is refined
+    right, weights = poses["error"] < THRESHOLD, _weights(poses, options)
+    return fit_calibration(poses["evidence"], right, EVIDENCE, weights, members=members)
 
 
 def _weights(poses: dict[str, np.ndarray], options: Options) -> Float[np.ndarray, " s"]:
