@@ -17,17 +17,18 @@ from kmn_jax.programs import kept
 from kmn_jax.simulate import Surfels
 from kmn_jax.typing import Scalar
 
-# Each is described where it is computed: of the picture in `PictureAgreement` and `DepthAgreement`. How sure the
-# network is of its keypoints is none: it is surer of the kinds of parts that it was trained with, and models of such
-# evidence predict other kinds worse.
+# Each is described where it is computed: of the picture in `PictureAgreement` and `DepthAgreement`.
 _OF_CROP = (
     "surface",  # score of the crop's points, see `CropPoses`; of a refined pose that of the pose that it was made of
     "fit",  # share of the points on the object that are near to the pose's surface
     "rms_error",  # of these, in diameters
     "inlier_share",  # of the matches
     "log_inliers",
+    "likelihood",  # mean, over the points on the object, of the probability of the keypoint nearest at the pose
     "straight",  # mean cosine of the two surfaces' normals where they meet
     "covered",  # share of the crop's points on the pose's surface that are on the object
+    "certainty",  # mean probability of the likeliest keypoint
+    "object_share",  # of the crop's points that are on the object
 )
 EVIDENCE = (*DepthAgreement._fields, *PictureAgreement._fields, *_OF_CROP)
 _NEAR = 0.1  # diameters
@@ -40,9 +41,10 @@ def evidence_on(
 ) -> Float[Array, "h f"]:
     """Return the evidence on each pose of a crop, in the order of EVIDENCE; zeros where there is none."""
     prediction = found.prediction
+    keypoint_scores = jax.nn.softmax(prediction.logits, axis=1)
 
     def of_pose(pose: PoseResult, score: Scalar) -> Float[Array, " f"]:
-        return _evidence(pose, score, prediction, found.seed, part, surfels, image, config)
+        return _evidence(pose, score, prediction, keypoint_scores, found.seed, part, surfels, image, config)
 
     return map_real(of_pose, found.poses.converged, found.poses, found.scores)
 
@@ -51,6 +53,7 @@ def _evidence(
     found: PoseResult,
     score: Scalar,
     prediction: Prediction,
+    keypoint_scores: Float[Array, "n k"],
     seed: Float[Array, "3"],
     part: PartArrays,
     surfels: Surfels,
@@ -61,6 +64,7 @@ def _evidence(
     picture = picture_agreement(pose, surfels, image, part.diameter)
     seen = depth_agreement(pose, surfels, image, part.diameter, config)
     local = transform_points(inverse(pose), prediction.points + seed[None])
+    label, _ = nearest(local, part.points[: keypoint_scores.shape[1]])
     row, distance = nearest(local, part.points)
     normals = jnp.matmul(prediction.normals, pose[:3, :3], precision=jax.lax.Precision.HIGHEST)
     cosine = (normals * part.normals[row]).sum(axis=1)
@@ -75,8 +79,11 @@ def _evidence(
         "rms_error": jnp.where(near.any(), jnp.sqrt(_mean(distance**2, near)), _NEAR),
         "inlier_share": found.score,
         "log_inliers": jnp.log1p(found.num_inliers.astype(jnp.float32)),
+        "likelihood": _mean(jnp.take_along_axis(keypoint_scores, label[:, None], axis=1)[:, 0], on_object),
         "straight": _mean(cosine, on_object & (distance <= _SURFACE)),
         "covered": _mean(on_object, surface),
+        "certainty": _mean(keypoint_scores.max(axis=1), on_object),
+        "object_share": _mean(on_object, prediction.mask),
     }
     return jnp.stack([columns[name] for name in EVIDENCE])
 

@@ -47,7 +47,7 @@ def motor(estimator: PoseEstimator) -> Part:
 
 @pytest.fixture(scope="module")
 def on_device(estimator: PoseEstimator, motor: Part) -> OnDevice:
-    assert estimator.model.config.num_scene_points == 1024
+    assert estimator.model.config.num_scene_points == 512
     return device_part(estimator.model, motor), device_calibration(estimator.probabilities.found)
 
 
