@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -103,13 +104,16 @@ def paused(path: Path | None) -> Iterator[None]:
             with suppress(ProcessLookupError):
                 os.kill(process, number)
 
-    send(signal.SIGSTOP)
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(1)) if ids else None  # or they would stay stopped
     try:
+        send(signal.SIGSTOP)
         if ids:
             time.sleep(0.3)  # what they have sent to the device ends
         yield
     finally:
         send(signal.SIGCONT)
+        if ids:
+            signal.signal(signal.SIGTERM, before)
 
 
 @dataclass(frozen=True)

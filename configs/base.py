@@ -5,7 +5,7 @@ mask serves all keypoints; Muon with warm-up and cosine, bfloat16 layers, and th
 
 base
     Command:   python -m experiments.train base
-    Hardware:  one GPU of 80 GB or more. Not yet run.
+    Hardware:  one GPU of 80 GB or more. Not yet run; on a single one with --crops-at-once 64, see base_worlds.
     Expected:  not yet known.
 
 base_worlds
@@ -40,7 +40,6 @@ base = TrainConfig(
         clip_norm=1.0,
     ),
     pipeline=PipelineConfig(batch_size=128, crops_per_object=4),
-    crops_at_once=64,
     average_decay=0.999,
 )
 
@@ -52,6 +51,7 @@ base_worlds = replace(
     network=replace(base.network, inputs="chiral", num_keypoints=64),
     examples=replace(worlds.examples, crops=replace(worlds.examples.crops, num_points=2_048)),
     optimizer=replace(base.optimizer, warmup_steps=100),
+    crops_at_once=64,
     average_decay=0.99,
     validation_samples=20,
     checkpoint_every=500,

@@ -13,14 +13,15 @@ worlds
     Hardware:  2 CPU cores: 15 minutes for the pack; 55 to 60 samples/s, half as many beside other work.
     Expected:  after 168,000 samples, 0.9 h beside other work: validation loss 2.149, segmentation accuracy 0.956,
                keypoint accuracy 0.152 of 64. These are the released weights, to go on from without --warm-start. FILE
-               were those of 160,000 samples in worlds of components, with invariant
-               inputs and 20 keypoints (1.627 and 0.231 of 20; `experiments/assets/worlds.safetensors` at commit
-               a4dca0e, where the run was called `chiral`), which had begun with the 560,000 above.
+               were those of 160,000 samples in worlds of components, with invariant inputs and 20 keypoints (1.627 and
+               0.231 of 20; `experiments/assets/worlds.safetensors` at commit a4dca0e, where the run was called
+               `chiral`), which had begun with the 560,000 above.
 
 worlds_long
     With the 1,024 points that a search draws.
     Command:   python -m experiments.train worlds_long
-    Hardware:  one H200, 11 minutes beside other runs, of which compiling took 3; 7,000 samples/s alone.
+    Hardware:  one H200, 11 minutes beside other runs, 3 of them until the first step; 5,600 samples/s in the median,
+               7,000 at best.
     Expected:  after 1,792,000 samples: validation loss 2.044, segmentation accuracy 0.957, keypoint accuracy 0.168 of
                64; docs/training.md says why they are not released. The weights are
                `experiments/assets/worlds_long.safetensors`.

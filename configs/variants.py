@@ -4,7 +4,7 @@ variant_reference is `small` itself; every other one differs from it by what its
 
 variant_...
     Command:   python -m experiments.train variant_reference, and the same with the other names
-    Hardware:  one H200, several side by side: 1,900 to 5,300 samples/s each, one to two minutes of compiling.
+    Hardware:  one H200, several side by side: 1,800 to 5,300 samples/s each; up to three minutes until the first step.
     Expected:  after 128,000 samples validation losses of 2.32 (reference), 2.31 (points_1024), 2.21 (wide), 2.42
                (dynamic) and 2.33 (invariant); docs/training.md has the recalls. The others have not been run.
 """

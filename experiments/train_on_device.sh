@@ -1,23 +1,24 @@
 #!/bin/bash
 # Trains on a lent machine with an accelerator, its own jax and no registry, by calls that follow each other:
 #   experiments/train_on_device.sh take PARTS             install PARTS/*.whl, unpack PARTS/*.tar.* into outputs/packs
-#   experiments/train_on_device.sh start COUNT NAME ...   train configs in the background, so many at once
+#   experiments/train_on_device.sh start COUNT NAME ...   train configs in the background, so many at once; one call
 #   experiments/train_on_device.sh look                   how far they are, and what went wrong
-#   experiments/train_on_device.sh steps NAME NUMBER      end a config's run after so many steps in all, its rate with it
+#   experiments/train_on_device.sh steps NAME NUMBER      let a run that has begun end after so many steps in all
 #   experiments/train_on_device.sh stop OUTPUT            stop all, with everything saved, and pack the runs
 # All happens in a copy of the checkout, KMN_DEVICE (/tmp/kmn), as the next call may replace the checkout. PARTS holds
 # what one call can carry: wheels of what the machine lacks (grain, array-record, portpicker, more-itertools, tyro,
-# docstring-parser, typeguard, shtab) and a part of the pack, such as of
-#   (cd outputs/packs && find surfels/objects -name '[A-L]*.safetensors' | tar cJ -T - -f PARTS/pack.tar.xz)
-# and the manifest in one of them. What `take` unpacks stays: a pack may come in several calls. OUTPUT gets the runs as
-# one tar file in pieces of 15.5 MB, of the first config with its newest checkpoint. Compiling a step takes a minute of
-# sixteen cores and longer beside others, so that few runs at once keep the device busy. Leave XLA's autotuning on:
-# without it products for gradients take most of a step.
+# docstring-parser, typeguard, shtab) and a part of the pack, made in outputs/packs by commands such as
+#   find surfels/objects -name '[A-L]*.safetensors' | tar cJ -T - -f "$PARTS/pack.tar.xz"
+# and the manifest with one of them. What `take` unpacks stays: a pack may come in several calls. Visibility bits are too
+# large to carry, so that scenes of a pack need --examples.visibility splat in `train` below; worlds need no bits.
+# OUTPUT gets the runs as one tar file in pieces of 15.5 MB, of the first config with its newest checkpoint. Compiling a
+# step takes a minute of sixteen cores and longer beside others, so that few runs at once keep the device busy. Leave
+# XLA's autotuning on: without it products for gradients take most of a step.
 set -euo pipefail
-state=${KMN_DEVICE:-/tmp/kmn}
+state=$(realpath -m "${KMN_DEVICE:-/tmp/kmn}")
 here=$(cd "$(dirname "$0")/.." && pwd)
-what=$1
-shift
+what=${1:-}
+shift || true
 mkdir -p "$state/logs" "$state/runs" "$state/site"
 export PYTHONPATH=$state/site PYTHONUNBUFFERED=1 XLA_PYTHON_CLIENT_PREALLOCATE=false
 export JAX_COMPILATION_CACHE_DIR=$state/compiled
@@ -27,10 +28,14 @@ train() { # NAME [--field value ...]
     echo "$1 did not end well" >>"$state/logs/$1.log"
 }
 
-# Stop runs between two steps and wait until all is saved: of one config, or of all.
+# Stop runs between two steps, also such as a benchmark has stopped, and wait until all is saved: of one config, or of
+# all. A run that compiles hears it late; after WAIT seconds it is killed, and loses what it has done since it last saved.
 end() {
-  pkill -TERM -f "experiments.train ${1:-.*} --folder $state" || true
-  while pgrep -f "experiments.train ${1:-.*} --folder $state" >/dev/null; do sleep 0.2; done
+  local runs="experiments.train ${1:-.*} --folder $state" left=$((5 * ${WAIT:-120}))
+  pkill -TERM -f "$runs" || true
+  pkill -CONT -f "$runs" || true
+  while pgrep -f "$runs" >/dev/null && ((left-- > 0)); do sleep 0.2; done
+  pkill -KILL -f "$runs" || true
 }
 
 case $what in
@@ -40,9 +45,15 @@ take)
     python3 -m pip install -q --no-index --no-deps --no-compile --no-cache-dir --upgrade --target "$state/site" "$1"/*.whl
   fi
   mkdir -p "$state/tree/outputs/packs"
-  for part in "$1"/*.tar.*; do tar x -C "$state/tree/outputs/packs" -f "$part"; done
+  for part in "$1"/*.tar.*; do
+    [ ! -e "$part" ] || tar x -C "$state/tree/outputs/packs" -f "$part"
+  done
   ;;
 start)
+  if [ -e "$state/queue" ]; then
+    echo "runs were started before: name all of them in one call, or stop them" >&2
+    exit 2
+  fi
   export -f train
   export state
   printf '%s\n' "$2" >"$state/first"
@@ -51,9 +62,10 @@ start)
   echo $! >"$state/queue"
   ;;
 look)
-  for run in "$state"/runs/*/; do
-    echo "$(basename "$run"): $(tail -qn 1 "$run/metrics.jsonl" 2>/dev/null | cut -c 1-240)"
-    tr '\r' '\n' <"$state/logs/$(basename "$run").log" | grep -E "did not end well|Error|^done|^stopped" || true
+  for log in "$state"/logs/*.log; do
+    name=$(basename "$log" .log)
+    echo "$name: $(tail -qn 1 "$state/runs/$name/metrics.jsonl" 2>/dev/null | cut -c 1-240)"
+    tr '\r' '\n' <"$log" | grep -E "did not end well|[Ee]rror|^train:|^done|^stopped" || true
   done
   ;;
 steps)
@@ -64,16 +76,21 @@ steps)
   setsid nohup bash -c "train $1 --num-steps $2" >/dev/null 2>&1 &
   ;;
 stop)
-  kill "$(cat "$state/queue")" 2>/dev/null || true
+  output=$(realpath -m "$1")
+  if [ -e "$state/queue" ]; then kill "$(cat "$state/queue")" 2>/dev/null || true; fi
   end
-  mkdir -p "$1"
+  rm -rf "$state/queue" "$output"/runs.tar.*
+  mkdir -p "$output"
   cd "$state"
-  first=$(cat first)
-  { find runs logs -type f ! -path '*/checkpoints/*'; find "$(ls -dt runs/"$first"/checkpoints/step-* | head -n 1)" -type f; } |
-    tar c -T - | split -b 15500000 - "$1/runs.tar."
+  newest=$(find runs/"$(cat first 2>/dev/null)"/checkpoints -maxdepth 1 -name 'step-*' -printf '%T@ %p\n' 2>/dev/null |
+    sort -n | tail -n 1 | cut -d ' ' -f 2 || true)
+  {
+    find runs logs -type f ! -path '*/checkpoints/*'
+    [ -z "$newest" ] || find "$newest" -type f
+  } | tar c -T - | split -b 15500000 - "$output/runs.tar."
   ;;
 *)
-  sed -n 2,8p "$0"
+  sed -n 2,7p "$0"
   exit 2
   ;;
 esac

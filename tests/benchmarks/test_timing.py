@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from benchmarks.memory import run_apart
-from benchmarks.timing import Ceilings, compile_for, time_in_turn
+from benchmarks.timing import Ceilings, compile_for, paused, time_in_turn
 from kmn_jax.errors import InputError
 from kmn_jax.report import check_target, print_table, write_json
 
@@ -67,3 +68,23 @@ def test_results_carry_their_environment(tmp_path: Path, capsys: pytest.CaptureF
     assert {"device", "versions", "commit", "date", "command"} <= written["environment"].keys()
     with pytest.raises(InputError, match="cannot write"):
         check_target(tmp_path / "out")  # before anything is measured
+
+
+def test_what_shares_the_device_is_stopped_while_it_is_timed(tmp_path: Path) -> None:
+    with subprocess.Popen(["sleep", "60"]) as other, subprocess.Popen(["true"]) as ended:
+        ended.wait()
+        path = tmp_path / "ids"
+        path.write_text(f"{other.pid}\n{ended.pid}\n")
+
+        def status() -> str:
+            return Path(f"/proc/{other.pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+
+        try:
+            with pytest.raises(RuntimeError, match="timing failed"), paused(path):
+                assert status() == "T"
+                raise RuntimeError("timing failed")
+            assert status() != "T"
+        finally:
+            other.kill()
+    with paused(None):  # nothing to stop
+        pass

@@ -40,7 +40,7 @@ def machine(tmp_path: Path) -> Iterator[dict[str, str]]:
     python.chmod(0o755)
     (tmp_path / "state" / "tree").mkdir(parents=True)  # in place of a copy of the checkout
     yield {"PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}", "KMN_DEVICE": str(tmp_path / "state")}
-    subprocess.run(["pkill", "-KILL", "-f", f"--folder {tmp_path}"], check=False)
+    subprocess.run(["pkill", "-KILL", "-f", "--", f"--folder {tmp_path}"], check=False)
 
 
 def call(machine: dict[str, str], *arguments: str) -> str:
@@ -49,12 +49,12 @@ def call(machine: dict[str, str], *arguments: str) -> str:
     return done.stdout
 
 
-def wait_for(path: Path) -> None:
+def wait_for(path: Path, text: str = "") -> None:
     for _ in range(200):
-        if path.exists():
+        if path.exists() and text in path.read_bytes().decode(errors="replace"):
             return
         time.sleep(0.05)
-    raise AssertionError(f"{path} was not written")
+    raise AssertionError(f"{path} was not written, or without {text!r}")
 
 
 def test_a_pack_comes_in_parts(machine: dict[str, str], tmp_path: Path) -> None:
@@ -80,8 +80,7 @@ def test_runs_outlive_the_call_and_come_back_whole(machine: dict[str, str], tmp_
 
     call(machine, "steps", "long", "700")
     wait_for(state / "runs" / "long" / "checkpoints" / "step-2" / "state")
-    while "700" not in (state / "runs" / "long" / "metrics.jsonl").read_text():
-        time.sleep(0.05)
+    wait_for(state / "runs" / "long" / "metrics.jsonl", "--num-steps 700")
     call(machine, "stop", str(tmp_path / "back"))
 
     pieces = sorted((tmp_path / "back").iterdir())
