@@ -7,6 +7,13 @@ variant_...
     Hardware:  one H200, several side by side: 1,800 to 5,300 samples/s each; up to three minutes until the first step.
     Expected:  after 128,000 samples validation losses of 2.32 (reference), 2.31 (points_1024), 2.21 (wide), 2.42
                (dynamic) and 2.33 (invariant); docs/training.md has the recalls. The others have not been run.
+
+wide_long, dynamic_long
+    The two that found more, trained for long: wide_long from random parameters, dynamic_long from those of `small`, whose
+    parameters have the same shapes.
+    Command:   python -m experiments.train wide_long, and the same with the other name
+    Hardware:  one H200.
+    Expected:  not yet known.
 """
 
 from __future__ import annotations
@@ -48,3 +55,21 @@ VARIANTS = (
     _variant("invariant", inputs="invariant"),
     _variant("narrow", edge_width=16, embedding_width=256, scene_width=128, object_width=32, pair_width=64),
 )
+
+_NAMED = {variant.name: variant for variant in VARIANTS}
+
+
+def _long(name: str, **changes: object) -> TrainConfig:
+    of = _NAMED[f"variant_{name}"]
+    long = replace(
+        of,
+        name=f"{name}_long",
+        num_steps=9_000,
+        optimizer=replace(of.optimizer, warmup_steps=200),
+        average_decay=0.998,
+        validate_every=1_500,
+    )
+    return replace(long, **changes)  # type: ignore[arg-type]
+
+
+LONG = (_long("wide"), _long("dynamic", warm_start="small"))

@@ -95,7 +95,7 @@ def warm_parameters(config: TrainConfig) -> nnx.State | None:
 
 
 def _for_data_of(other: KeyMatchNetConfig, config: KeyMatchNetConfig) -> KeyMatchNetConfig:
-    """Return a network's config with another's sizes of data, as far as its parameters do not depend on them."""
+    """Return a network's config with another's graph and sizes of data, as far as its parameters fit both."""
     if config.object_branch == "learned":  # it has parameters for each keypoint
         return config
     return replace(
@@ -103,6 +103,7 @@ def _for_data_of(other: KeyMatchNetConfig, config: KeyMatchNetConfig) -> KeyMatc
         num_scene_points=other.num_scene_points,
         num_object_points=other.num_object_points,
         num_keypoints=other.num_keypoints,
+        graph=other.graph,
     )
 
 
