@@ -5,9 +5,10 @@ network was not trained with, and with `--worlds` and `--known-worlds` in the wh
 image also a part that is not there. A small model of the evidence is fitted to whether they are right. Each object's
 probabilities are also predicted by a model that was fitted without it, which gives the reliability that is printed. The
 model of poses as they are found is fitted first: it chooses which of them are refined, here as in detection. Of refined
-poses detection reports one for each place. Models are too sure of themselves about kinds of objects that they were not
-fitted to: so the scale of the refined poses' model is fitted to what detection would report by models that do not know
-the kind.
+poses detection reports one for each place: the one that a third model holds for the most probable, which is fitted to
+whether all points are in their places (MSSD), and not their mean (ADI). Models are too sure of themselves about kinds
+of objects that they were not fitted to: so the scales of the refined poses' models are fitted to what detection would
+report by models that do not know the kind.
 """
 
 from __future__ import annotations
@@ -71,6 +72,7 @@ class Options:
     known_worlds: Path | None = None  # the same, of parts that the network was trained with: no scale is fitted to it
     every: int = 1  # use every so many images of `bins`
     folds: int = 5
+    members: int = 5  # fits, whose mean is the model of refined poses
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
     output: Path = SHIPPED  # the calibration
     candidates: Path | None = None  # .npz file to write the candidates to, or to read them from if it exists
@@ -89,12 +91,19 @@ class Search(NamedTuple):
     is_known: bool  # whether the network was trained with such parts
 
     def columns(self, found: Candidates) -> dict[str, np.ndarray]:
-        """Return evidence, error and object of poses; those of a part that is not there have no finite error."""
-        error = self.image.errors(found.T_camera_object[found.usable]).min(axis=1, initial=np.inf)
+        """Return evidence, errors and object of poses; those of a part that is not there have no finite errors."""
+        poses = found.T_camera_object[found.usable]
+        errors = [
+            errors.min(axis=1, initial=np.inf)
+            for errors in (self.image.errors(poses), self.image.largest_errors(poses))
+        ]
+        if self.part is not self.image.part:
+            errors = [np.full_like(error, np.inf) for error in errors]
         return {
             "evidence": found.evidence[found.usable],
-            "error": error if self.part is self.image.part else np.full_like(error, np.inf),
-            "object": np.full(len(error), self.number),
+            "error": errors[0],
+            "largest_error": errors[1],
+            "object": np.full(len(poses), self.number),
         }
 
 
@@ -121,13 +130,21 @@ def collect(options: Options, model: Model) -> dict[str, np.ndarray]:
             finer.append((_without_crops(refined), search.on_device, search.number, search.is_known))
     fine = _joined(parts)
     fine["refined"] = np.ones(len(fine["error"]), dtype=bool)
-    others = {name: fitted for names, fitted in held_out_models(fine, options) for name in names}
+    others, exact = (
+        {name: fitted for names, fitted in held_out_models(rows, options) for name in names}
+        for rows in (fine, by_largest_error(fine))
+    )
     reported = [
-        chosen(refined, others[number], on_device, DetectConfig()).kept[refined.usable] & (not is_known)
+        chosen(refined, others[number], on_device, DetectConfig(), exact[number]).kept[refined.usable] & (not is_known)
         for refined, on_device, number, is_known in finer
     ]
     none = np.zeros(len(poses["error"]), dtype=bool)
     return _joined([poses | {"refined": none, "reported": none}, fine | {"reported": np.concatenate(reported)}])
+
+
+def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return poses that are right if all of their points are."""
+    return poses | {"error": poses["largest_error"]}
 
 
 def _joined(columns: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -203,7 +220,9 @@ def held_out_models(
 
 
 def _model(poses: dict[str, np.ndarray], options: Options) -> Calibration:
-    return fit_calibration(poses["evidence"], poses["error"] < THRESHOLD, EVIDENCE, _weights(poses, options))
+    members = options.members if poses["refined"].all() else 1  # one is enough to choose what is refined
+    right, weights = poses["error"] < THRESHOLD, _weights(poses, options)
+    return fit_calibration(poses["evidence"], right, EVIDENCE, weights, members=members)
 
 
 def _weights(poses: dict[str, np.ndarray], options: Options) -> Float[np.ndarray, " s"]:
@@ -269,8 +288,10 @@ def calibrate(options: Options) -> dict[str, Any]:
         if options.candidates is not None:
             np.savez(options.candidates, allow_pickle=False, made_of=np.array(made_of), **poses)
     models, results = [], {}
-    for name, own in (("found", ~poses["refined"]), ("refined", poses["refined"])):
-        model, results[name] = fit({column: values[own] for column, values in poses.items()}, options)
+    refined = {column: values[poses["refined"]] for column, values in poses.items()}
+    found = {column: values[~poses["refined"]] for column, values in poses.items()}
+    for name, rows in (("found", found), ("refined", refined), ("exact", by_largest_error(refined))):
+        model, results[name] = fit(rows, options)
         models.append(model)
         print_table(f"Reliability of poses as {name}, of objects that were not fitted to", results[name]["reliability"])
         print_table(f"Poses as {name}", [results[name]["summary"]])

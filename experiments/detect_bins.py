@@ -228,7 +228,7 @@ def _found(name: str, model: Model, fitted: Probabilities, image: BinImage) -> D
     if len(rows):
         with clock("refinement"):
             candidates = refined_candidates(on_device, image.scene, candidates, rows, 0, CONFIG.search)
-            choice = chosen(candidates, fitted.refined, on_device, CONFIG)
+            choice = chosen(candidates, fitted.refined, on_device, CONFIG, fitted.exact)
     poses = detections(candidates, choice, fitted.refined, image.part, image.scene)
     return Detections(image.part.name, image.scene.unit, poses, clock.timing, None, warnings)
 

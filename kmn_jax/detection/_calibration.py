@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -94,10 +94,13 @@ def fit_calibration(
     weights: Float[np.ndarray, " s"] | None = None,
     hidden_units: int = _HIDDEN,
     ridge: float = _RIDGE,
+    members: int = 1,
 ) -> Calibration:
     """Fit to poses of which it is known whether they are right; `weights` count some as several.
 
-    The same arguments give the same model on one machine. Raises InputError if all are right or all are wrong.
+    With several `members` the model is the mean of as many fits that begin elsewhere: each errs in its own way about
+    kinds of objects that it has not seen. The same arguments give the same model on one machine. Raises InputError if
+    all are right or all are wrong.
     """
     from scipy.optimize import minimize
 
@@ -133,13 +136,16 @@ def fit_calibration(
         slope = [columns.T @ back, back.sum(axis=0), hidden.T @ error, columns.T @ error, error.sum()]
         return float(value), np.concatenate([part.reshape(-1) for part in slope]) + ridges * solution
 
-    start = np.zeros(ends[-1])
-    rng = np.random.default_rng(0)
-    start[: f * u] = rng.normal(size=f * u) / np.sqrt(f)
-    start[f * u + u : f * u + 2 * u] = rng.normal(size=u) / 4
-    options = {"maxiter": _ITERATIONS, "maxfun": 2 * _ITERATIONS, "ftol": 1e-12, "gtol": 1e-8}
-    solution = minimize(loss, start, jac=True, method="L-BFGS-B", options=options).x
-    inner, inner_bias, slopes, direct, bias = unpacked(solution)
+    def member(random_seed: int) -> list[Float[np.ndarray, "..."]]:
+        start, rng = np.zeros(ends[-1]), np.random.default_rng(random_seed)
+        start[: f * u] = rng.normal(size=f * u) / np.sqrt(f)
+        start[f * u + u : f * u + 2 * u] = rng.normal(size=u) / 4
+        options = {"maxiter": _ITERATIONS, "maxfun": 2 * _ITERATIONS, "ftol": 1e-12, "gtol": 1e-8}
+        return unpacked(minimize(loss, start, jac=True, method="L-BFGS-B", options=options).x)
+
+    fitted = [member(random_seed) for random_seed in range(members)]
+    inner, inner_bias, slopes = (np.concatenate(parts, axis=-1) for parts in list(zip(*fitted, strict=True))[:3])
+    slopes, direct, bias = slopes / members, *(np.mean([parts[row] for parts in fitted], axis=0) for row in (3, 4))
     inner, direct = inner / scale[:, None], direct / scale
     return Calibration(
         tuple(names),
@@ -176,10 +182,15 @@ def reliability(
 
 @dataclass(frozen=True)
 class Probabilities:
-    """The model of poses as they are found, which chooses among them, and that of refined ones, which is reported."""
+    """The model of poses as they are found, which chooses among them, and that of refined ones, which is reported.
+
+    `exact` is of refined poses that are right in all of their points, not on average: it tells poses of one place apart
+    that are turned against each other.
+    """
 
     found: Calibration
     refined: Calibration
+    exact: Calibration
 
 
 def probabilities_bytes(probabilities: Probabilities) -> bytes:
@@ -191,7 +202,7 @@ def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
     """Read models of the evidence with the given names. Raises InputError if the file holds anything else."""
     try:
         stored = parse_json(Path(path).read_text(encoding="utf-8"))
-        models = [_read(found) for found in (stored["found"], stored["refined"])]
+        models = [_read(stored[field.name]) for field in fields(Probabilities)]
     except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path} is not a readable calibration: {shown(error)}") from None
     if any(model.names != tuple(names) for model in models):

@@ -128,7 +128,7 @@ def detect(
                 rows = np.flatnonzero(choice.kept | choice.contenders)
                 found = refined_candidates(on_device, scene, found, rows, random_seed, search)
             with clock("selection"):
-                choice = chosen(found, calibration, on_device, config)
+                choice = chosen(found, calibration, on_device, config, probabilities.exact)
     with clock("report"):
         poses = detections(found, choice, calibration, part, scene)
         accepted = choice.kept & (calibration.probability(found.evidence) >= config.accepted)
@@ -244,15 +244,22 @@ def _forms_first(leaf: Any) -> np.ndarray:
     return np.swapaxes(leaf, 0, 1).reshape(-1, *leaf.shape[2:])
 
 
-def chosen(found: Candidates, calibration: Calibration, part: DevicePart, config: DetectConfig) -> Selection:
-    """Choose among the most probable candidates."""
+def chosen(
+    found: Candidates,
+    calibration: Calibration,
+    part: DevicePart,
+    config: DetectConfig,
+    exact: Calibration | None = None,
+) -> Selection:
+    """Choose among the most probable candidates, by an `exact` model where there is one."""
     probability = calibration.probability(found.evidence)
     possible = found.usable & (probability >= config.reported)
     ranked = np.argsort(-np.where(possible, probability, -1), kind="stable")[:_CONSIDERED]
     rows = np.pad(ranked, (0, _CONSIDERED - len(ranked)), mode="edge")
     usable = possible[rows] & (np.arange(_CONSIDERED) < len(ranked))
     poses = found.T_camera_object[rows]
-    given = jax.device_put((poses, probability[rows].astype(np.float32), usable))
+    score = probability if exact is None else exact.probability(found.evidence)
+    given = jax.device_put((poses, score[rows].astype(np.float32), usable))
     few: Selection = jax.device_get(select_poses(given[0], given[1], given[2], part))
 
     def of_all(values: Any) -> Any:

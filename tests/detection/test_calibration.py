@@ -88,6 +88,26 @@ def test_evidence_that_decides_completely_keeps_finite_weights() -> None:
         fit_calibration(evidence, np.ones(4, dtype=bool), ("only",))
 
 
+def test_several_members_are_the_mean_of_their_models() -> None:
+    evidence, right = drawn(300)
+    one, three = (fit_calibration(evidence, right, NAMES, hidden_units=4, members=members) for members in (1, 3))
+    assert len(three.hidden_slopes) == 12
+    own = CalibrationArrays(*three.arrays())
+    # The first of the three is the one that is fitted alone, up to what all share.
+    first = own._replace(
+        hidden_weights=own.hidden_weights[:, :4],
+        hidden_bias=own.hidden_bias[:4],
+        hidden_slopes=3 * own.hidden_slopes[:4],
+    )
+    hidden = [
+        model.logits(evidence, np) - evidence.clip(model.low, model.high) @ model.weights - model.bias
+        for model in (first, one.arrays())
+    ]
+    np.testing.assert_allclose(*hidden, rtol=1e-6, atol=1e-9)
+    losses = [np.mean(np.logaddexp(0, np.where(right, -1, 1) * model.logit(evidence))) for model in (one, three)]
+    assert losses[1] < losses[0] + 0.02
+
+
 def test_reliability_counts_every_pose_once() -> None:
     probability = np.array([0.0, 0.05, 0.55, 1.0])
     rows = reliability(probability, np.array([False, False, True, True]))
@@ -97,7 +117,8 @@ def test_reliability_counts_every_pose_once() -> None:
 
 def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.calibration.json"
-    fitted = Probabilities(Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25), fit_calibration(*drawn(100), NAMES))
+    logistic = Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25)
+    fitted = Probabilities(logistic, fit_calibration(*drawn(100), NAMES), logistic)
     path.write_bytes(probabilities_bytes(fitted))
     assert load_probabilities(path, NAMES) == fitted
     with pytest.raises(InputError, match="of other evidence"):
@@ -106,7 +127,7 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
         "",
         "[]",
         "{}",
-        '{"found": 1, "refined": {"names": ["first"], "weights": ["x"], "bias": 0}}',
+        '{"found": 1, "refined": {"names": ["first"], "weights": ["x"], "bias": 0}, "exact": 1}',
         _damaged(fitted),
         probabilities_bytes(fitted).decode().replace("-2.5", f"1{'0' * 400}"),
     ):

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.detection import DevicePart, Selection, same_place, select, symmetry_transforms
+from kmn_jax.detection import (
+    Calibration,
+    Candidates,
+    DetectConfig,
+    DevicePart,
+    Selection,
+    same_place,
+    select,
+    symmetry_transforms,
+)
+from kmn_jax.detection import chosen as choose_candidates
 from kmn_jax.detection._selection import _greedy, overlap
 from kmn_jax.objects import Part, PartArrays, Symmetries
 from kmn_jax.objects._symmetry import rotation_about
@@ -142,3 +153,21 @@ def test_one_pose_an_instance_is_kept_and_rivals_for_its_place_make_the_gap(firs
     np.testing.assert_array_equal(close.contenders, [False, False, True, False])
     without = chosen(poses, score, np.array([False, False, False, True]))
     np.testing.assert_array_equal(without.kept, [False, False, False, True])
+
+
+def test_of_turned_poses_in_one_place_the_exact_one_stands() -> None:
+    # Both are right on average and the second a little more probable; only the first is right in all of its points.
+    turned = moved(0, 0, 0, rotation_about(Z, np.pi / 2))
+    names = ("on average", "everywhere")
+    average, exact = Calibration(names, (1.0, 0.0), 2.0), Calibration(names, (0.0, 1.0), 0.0)
+    poses, evidence = np.stack([np.eye(4), turned]).astype(np.float32), np.array([[1.0, 2.0], [1.1, -2.0]])
+    nothing: Any = None  # what the network says of crops
+    count, crop = np.zeros(2, dtype=np.int32), np.zeros(2, dtype=np.int64)
+    found = Candidates(poses, np.ones(2, dtype=bool), evidence, count, crop, nothing, crop[:1])
+    part, config = on_device(BOX), DetectConfig()
+    assert choose_candidates(found, average, part, config).kept.tolist() == [False, True]
+    by_exact = choose_candidates(found, average, part, config, exact)
+    assert by_exact.kept.tolist() == [True, False]
+    assert by_exact.gap[0] == pytest.approx(1 / (1 + np.exp(-2.0)) - 1 / (1 + np.exp(2.0)), abs=1e-6)
+    doubted = Calibration(names, (0.0, 0.0), -5.0)  # what is not probable enough is not reported, however exact
+    assert not choose_candidates(found, doubted, part, config, exact).kept.any()
