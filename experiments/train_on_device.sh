@@ -2,7 +2,7 @@
 # Trains on a lent machine with an accelerator, its own jax and no registry, by calls that follow each other:
 #   experiments/train_on_device.sh take PARTS             install PARTS/*.whl, unpack PARTS/*.tar.* into outputs/packs
 #   experiments/train_on_device.sh start COUNT NAME ...   train configs in the background, so many at once; one call
-#   experiments/train_on_device.sh look                   how far they are, and what went wrong
+#   experiments/train_on_device.sh look [OUTPUT]          how far they are, and what went wrong; pack the runs so far
 #   experiments/train_on_device.sh steps NAME NUMBER      let a run that has begun end after so many steps in all
 #   experiments/train_on_device.sh stop OUTPUT            stop all, with everything saved, and pack the runs
 # All happens in a copy of the checkout, KMN_DEVICE (/tmp/kmn), as the next call may replace the checkout. PARTS holds
@@ -11,9 +11,10 @@
 #   find surfels/objects -name '[A-L]*.safetensors' | tar cJ -T - -f "$PARTS/pack.tar.xz"
 # and the manifest with one of them. What `take` unpacks stays: a pack may come in several calls. Visibility bits are too
 # large to carry, so that scenes of a pack need --examples.visibility splat in `train` below; worlds need no bits.
-# OUTPUT gets the runs as one tar file in pieces of 15.5 MB, of the first config with its newest checkpoint. Compiling a
-# step takes a minute of sixteen cores and longer beside others, so that few runs at once keep the device busy. Leave
-# XLA's autotuning on: without it products for gradients take most of a step.
+# OUTPUT gets the runs as one tar file in pieces of 15.5 MB, after `stop` that of the first config with its newest
+# checkpoint. Let every `look` pack: a machine may be gone by the next call, and all that did not come back with it.
+# Compiling a step takes a minute of sixteen cores and longer beside others, so that few runs at once keep the device
+# busy. Leave XLA's autotuning on: without it products for gradients take most of a step.
 set -euo pipefail
 state=$(realpath -m "${KMN_DEVICE:-/tmp/kmn}")
 here=$(cd "$(dirname "$0")/.." && pwd)
@@ -36,6 +37,14 @@ end() {
   pkill -CONT -f "$runs" || true
   while pgrep -f "$runs" >/dev/null && ((left-- > 0)); do sleep 0.2; done
   pkill -KILL -f "$runs" || true
+}
+
+# Pack runs and logs into a folder, with the files that standard input names.
+pack() { # FOLDER
+  mkdir -p "$1"
+  rm -f "$1"/runs.tar.*
+  { find runs logs -type f ! -path '*/checkpoints/*' && cat; } | { tar c -T - || [ $? = 1 ]; } | # 1: a file grew
+    split -b 15500000 - "$1/runs.tar."
 }
 
 case $what in
@@ -67,6 +76,11 @@ look)
     echo "$name: $(tail -qn 1 "$state/runs/$name/metrics.jsonl" 2>/dev/null | cut -c 1-240)"
     tr '\r' '\n' <"$log" | grep -E "did not end well|[Ee]rror|^train:|^done|^stopped" || true
   done
+  if [ -n "${1:-}" ]; then
+    output=$(realpath -m "$1")
+    cd "$state"
+    pack "$output" </dev/null
+  fi
   ;;
 steps)
   end "$1"
@@ -79,15 +93,11 @@ stop)
   output=$(realpath -m "$1")
   if [ -e "$state/queue" ]; then kill "$(cat "$state/queue")" 2>/dev/null || true; fi
   end
-  rm -rf "$state/queue" "$output"/runs.tar.*
-  mkdir -p "$output"
+  rm -f "$state/queue"
   cd "$state"
   newest=$(find runs/"$(cat first 2>/dev/null)"/checkpoints -maxdepth 1 -name 'step-*' -printf '%T@ %p\n' 2>/dev/null |
     sort -n | tail -n 1 | cut -d ' ' -f 2 || true)
-  {
-    find runs logs -type f ! -path '*/checkpoints/*'
-    [ -z "$newest" ] || find "$newest" -type f
-  } | tar c -T - | split -b 15500000 - "$output/runs.tar."
+  if [ -n "$newest" ]; then find "$newest" -type f; fi | pack "$output"
   ;;
 *)
   sed -n 2,7p "$0"

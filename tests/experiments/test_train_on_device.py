@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import tarfile
@@ -57,6 +58,15 @@ def wait_for(path: Path, text: str = "") -> None:
     raise AssertionError(f"{path} was not written, or without {text!r}")
 
 
+def packed(folder: Path) -> list[str]:
+    """Return the names of what was packed into a folder, in pieces that can be given back."""
+    pieces = sorted(folder.iterdir())
+    assert len(pieces) <= MOST_FILES
+    assert max(piece.stat().st_size for piece in pieces) <= MOST_BYTES
+    with tarfile.open(fileobj=io.BytesIO(b"".join(piece.read_bytes() for piece in pieces))) as whole:
+        return whole.getnames()
+
+
 def test_a_pack_comes_in_parts(machine: dict[str, str], tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / "made" / name).mkdir(parents=True)
@@ -74,20 +84,17 @@ def test_runs_outlive_the_call_and_come_back_whole(machine: dict[str, str], tmp_
     call(machine, "start", "2", "long", "bad", "short")
     for name in ("long", "bad", "short"):  # the third one when one of the first two has ended
         wait_for(state / "runs" / name / "metrics.jsonl")
-    said = call(machine, "look")
+    (state / "runs" / "short" / "model.safetensors").write_text("weights so far")
+    said = call(machine, "look", str(tmp_path / "back"))
     assert "bad did not end well" in said
     assert "ValueError: no pack" in said
+    assert {"runs/short/model.safetensors", "runs/long/metrics.jsonl"} <= set(packed(tmp_path / "back"))
 
     call(machine, "steps", "long", "700")
     wait_for(state / "runs" / "long" / "checkpoints" / "step-2" / "state")
     wait_for(state / "runs" / "long" / "metrics.jsonl", "--num-steps 700")
     call(machine, "stop", str(tmp_path / "back"))
 
-    pieces = sorted((tmp_path / "back").iterdir())
-    assert len(pieces) <= MOST_FILES
-    assert max(piece.stat().st_size for piece in pieces) <= MOST_BYTES
-    (tmp_path / "whole.tar").write_bytes(b"".join(piece.read_bytes() for piece in pieces))
-    with tarfile.open(tmp_path / "whole.tar") as whole:
-        names = set(whole.getnames())
-    assert {"runs/long/last.safetensors", "runs/short/last.safetensors", "logs/bad.log"} <= names
+    names = packed(tmp_path / "back")
+    assert {"runs/long/last.safetensors", "runs/short/last.safetensors", "logs/bad.log"} <= set(names)
     assert [name for name in names if "checkpoints" in name] == ["runs/long/checkpoints/step-2/state"]
