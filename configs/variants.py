@@ -9,8 +9,8 @@ variant_...
                (dynamic) and 2.33 (invariant); docs/training.md has the recalls. The others have not been run.
 
 wide_long, dynamic_long
-    The two that found more, trained for long: wide_long from random parameters, dynamic_long from those of `small`, whose
-    parameters have the same shapes.
+    The two that found more, trained for long: wide_long from random parameters, dynamic_long from those of `small`, as
+    its parameters have the same shapes.
     Command:   python -m experiments.train wide_long, and the same with the other name
     Hardware:  one H200.
     Expected:  not yet known.

@@ -8,7 +8,8 @@ model of poses as they are found is fitted first: it chooses which of them are r
 poses detection reports one for each place: the one that a third model holds for the most probable, which is fitted to
 whether all points are in their places (MSSD), and not their mean (ADI). Models are too sure of themselves about kinds
 of objects that they were not fitted to: so the scales of the refined poses' models are fitted to what detection would
-report by models that do not know the kind.
+report by models that do not know the kind. From the same poses a fourth model learns what poses of one scene say about
+each other.
 """
 
 from __future__ import annotations
@@ -17,13 +18,14 @@ import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 import tyro
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from tqdm import tqdm
 
 from experiments.bins import THRESHOLD, TrueImage, bin_images, world_images
@@ -31,6 +33,7 @@ from experiments.fpfh import fpfh_poses
 from experiments.reliability_picture import reliability_table, save_reliability
 from experiments.test_sets import SPLIT
 from kmn_jax.detection import (
+    COMPANY,
     EVIDENCE,
     Calibration,
     Candidates,
@@ -40,6 +43,7 @@ from kmn_jax.detection import (
     Scene,
     SearchConfig,
     chosen,
+    company,
     device_part,
     expected_calibration_error,
     fit_calibration,
@@ -57,6 +61,7 @@ from kmn_jax.report import check_target, print_table, write_json
 
 _LOOSE = DetectConfig(reported=0.03)  # refines more than detection does, so that the fit sees what is just refused
 _SCALE_RIDGE = 1e-4  # hardly any: it makes probabilities too modest
+_COLUMNS = ("evidence", "error", "largest_error", "object", "search", "refined", "reported")  # of poses
 _KINDS = 100  # more than the families of parts in a folder of world bins
 SHIPPED = Path(__file__).parent.parent / "kmn_jax" / "pretrained" / "small.calibration.json"
 
@@ -87,6 +92,7 @@ class Search(NamedTuple):
     part: Part  # the image's own, or its stranger
     on_device: DevicePart
     scene: Scene
+    row: int  # of all searches
     number: int  # that searches of one object, or of one family of parts, share
     is_known: bool  # whether the network was trained with such parts
 
@@ -104,11 +110,12 @@ class Search(NamedTuple):
             "error": errors[0],
             "largest_error": errors[1],
             "object": np.full(len(poses), self.number),
+            "search": np.full(len(poses), self.row),
         }
 
 
 def collect(options: Options, model: Model) -> dict[str, np.ndarray]:
-    """Return evidence, outcome and object of all poses, and whether they are refined, and what is judged.
+    """Return evidence, outcome, object and search of all poses, and whether they are refined, and what is judged.
 
     Images are read twice, as they do not all fit into memory.
     """
@@ -153,10 +160,11 @@ def _joined(columns: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 def _searches(options: Options, model: Model) -> Iterator[Search]:
     """Yield all images with their parts, and every second one with a part that is not there."""
-    for count, (number, image, scene, is_known) in enumerate(_images(options, model)):
-        for part in (image.part, image.stranger if count % 2 == 0 else None):
+    searches = count()
+    for row, (number, image, scene, is_known) in enumerate(_images(options, model)):
+        for part in (image.part, image.stranger if row % 2 == 0 else None):
             if part is not None:
-                yield Search(image, part, device_part(model, part), scene, number, is_known)
+                yield Search(image, part, device_part(model, part), scene, next(searches), number, is_known)
 
 
 def _images(options: Options, model: Model) -> Iterator[tuple[int, TrueImage, Scene, bool]]:
@@ -211,12 +219,15 @@ def held_out_models(
     poses: dict[str, np.ndarray], options: Options
 ) -> Iterator[tuple[Int[np.ndarray, " o"], Calibration]]:
     """Yield some objects, and the model that is fitted to the poses of all others, until each had its turn."""
-    names = np.unique(poses["object"])
-    for fold in range(options.folds):
-        own = names[fold :: options.folds]
+    for own in _folds(poses, options):
         others = ~np.isin(poses["object"], own)
-        if len(own):
-            yield own, _model({column: values[others] for column, values in poses.items()}, options)
+        yield own, _model({column: values[others] for column, values in poses.items()}, options)
+
+
+def _folds(poses: dict[str, np.ndarray], options: Options) -> list[Int[np.ndarray, " o"]]:
+    """Return the objects of poses in groups, each of which has its turn as what is not fitted to."""
+    names = np.unique(poses["object"])
+    return [names[fold :: options.folds] for fold in range(min(options.folds, len(names)))]
 
 
 def _model(poses: dict[str, np.ndarray], options: Options) -> Calibration:
@@ -231,13 +242,21 @@ def _weights(poses: dict[str, np.ndarray], options: Options) -> Float[np.ndarray
     return np.where(absent & poses["refined"], options.absent_weight, 1.0)
 
 
-def fit(poses: dict[str, np.ndarray], options: Options) -> tuple[Calibration, dict[str, Any]]:
-    """Return the model of all poses, and how well models predict the objects that they were not fitted to.
+class Fitted(NamedTuple):
+    """The model of all poses, and how well models predict the objects that they were not fitted to."""
+
+    model: Calibration
+    held_out: Float[np.ndarray, " s"]  # log odds of all poses by models that do not know their object
+    results: dict[str, Any]
+
+
+def fit(poses: dict[str, np.ndarray], options: Options) -> Fitted:
+    """Fit a model of evidence.
 
     Where some poses are those that detection reports, the scale of the model is fitted to them, as models of other
     objects predict them, and they are what is judged.
     """
-    right, there = poses["error"] < THRESHOLD, np.isfinite(poses["error"])
+    right = poses["error"] < THRESHOLD
     held_out = np.zeros(len(right))
     for names, others in held_out_models(poses, options):
         own = np.isin(poses["object"], names)
@@ -250,11 +269,36 @@ def fit(poses: dict[str, np.ndarray], options: Options) -> tuple[Calibration, di
         if scale.weights[0] <= 0:
             raise InputError("poses are right no more often where models of other objects say so: give more bins")
         model, held_out = model.scaled(scale.weights[0], scale.bias), scale.weights[0] * held_out + scale.bias
-    probability, right, there = 1 / (1 + np.exp(-held_out[judged])), right[judged], there[judged]
+    return Fitted(model, held_out, _judged({name: values[judged] for name, values in poses.items()}, held_out[judged]))
+
+
+def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: Options) -> Fitted:
+    """Fit the model of what poses that are reported of one search say about each other, given the log odds of each."""
+    logits = logits[poses["reported"]]
+    poses = {name: values[poses["reported"]] for name, values in poses.items()}
+    right, columns, alone = poses["error"] < THRESHOLD, np.zeros((len(logits), 2)), np.zeros(len(logits), dtype=bool)
+    for search in np.unique(poses["search"]):
+        rows = np.flatnonzero(poses["search"] == search)
+        columns[rows], alone[rows] = company(logits[rows]), len(rows) == 1
+
+    def model_of(rows: Bool[np.ndarray, " s"]) -> Calibration:
+        return fit_calibration(columns[rows], right[rows], COMPANY, hidden_units=0, ridge=_SCALE_RIDGE)
+
+    held_out = logits.copy()
+    for names in _folds(poses, options):
+        own = np.isin(poses["object"], names)
+        held_out[own & ~alone] = model_of(~own & ~alone).logit(columns[own & ~alone])
+    return Fitted(model_of(~alone), held_out, _judged(poses, held_out))
+
+
+def _judged(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"]) -> dict[str, Any]:
+    """Return how well log odds predict which poses are right."""
+    right, there = poses["error"] < THRESHOLD, np.isfinite(poses["error"])
+    probability = 1 / (1 + np.exp(-logits))
     accepted = probability >= DetectConfig().accepted
     present = accepted & there
     summary = {
-        "objects": len(np.unique(poses["object"][judged])),
+        "objects": len(np.unique(poses["object"])),
         "poses": len(right),
         "right": float(right.mean()),
         "expected calibration error": expected_calibration_error(probability, right),
@@ -262,7 +306,7 @@ def fit(poses: dict[str, np.ndarray], options: Options) -> tuple[Calibration, di
         "right among accepted where the part is": float(right[present].mean()) if present.any() else None,
         "accepted among right": float(accepted[right].mean()),
     }
-    return model, {"summary": summary, "reliability": reliability_table(probability, right)}
+    return {"summary": summary, "reliability": reliability_table(probability, right)}
 
 
 def _made_of(options: Options, model: Model) -> str:
@@ -281,21 +325,25 @@ def calibrate(options: Options) -> dict[str, Any]:
     if options.candidates is not None and options.candidates.exists():
         with np.load(options.candidates) as stored:
             poses = dict(stored)
-        if str(poses.pop("made_of", "")) != made_of:
+        if str(poses.pop("made_of", "")) != made_of or set(poses) != set(_COLUMNS):
             raise InputError(f"{options.candidates} holds poses of other bins, weights or settings: remove it")
     else:
         poses = collect(options, network)
         if options.candidates is not None:
             np.savez(options.candidates, allow_pickle=False, made_of=np.array(made_of), **poses)
-    models, results = [], {}
     refined = {column: values[poses["refined"]] for column, values in poses.items()}
     found = {column: values[~poses["refined"]] for column, values in poses.items()}
-    for name, rows in (("found", found), ("refined", refined), ("exact", by_largest_error(refined))):
-        model, results[name] = fit(rows, options)
-        models.append(model)
-        print_table(f"Reliability of poses as {name}, of objects that were not fitted to", results[name]["reliability"])
-        print_table(f"Poses as {name}", [results[name]["summary"]])
-    write_whole(options.output, probabilities_bytes(Probabilities(*models)))
+    fitted = {
+        name: fit(rows, options)
+        for name, rows in (("found", found), ("refined", refined), ("exact", by_largest_error(refined)))
+    }
+    fitted["together"] = fit_together(refined, fitted["refined"].held_out, options)
+    results = {name: one.results for name, one in fitted.items()}
+    for name, result in results.items():
+        print_table(f"Reliability of poses as {name}, of objects that were not fitted to", result["reliability"])
+        print_table(f"Poses as {name}", [result["summary"]])
+    probabilities = Probabilities(**{name: one.model for name, one in fitted.items()})
+    write_whole(options.output, probabilities_bytes(probabilities))
     write_json(options.json, results)
     save_reliability({f"poses as {name}": found["reliability"] for name, found in results.items()}, options.picture)
     return results

@@ -43,6 +43,7 @@ from kmn_jax.detection import (
     explore,
     load_probabilities,
     refined_candidates,
+    reported,
 )
 from kmn_jax.errors import InputError
 from kmn_jax.models import Model, load_model, load_pretrained
@@ -224,12 +225,13 @@ def _found(name: str, model: Model, fitted: Probabilities, image: BinImage) -> D
     candidates, warnings = explore(image.scene, image.part, propose, fitted.found, CONFIG, clock)
     with clock("selection"):
         choice = chosen(candidates, fitted.found, on_device, CONFIG)
+    probability = fitted.found.probability(candidates.evidence)
     rows = np.flatnonzero(choice.kept | choice.contenders)
     if len(rows):
         with clock("refinement"):
             candidates = refined_candidates(on_device, image.scene, candidates, rows, 0, CONFIG.search)
-            choice = chosen(candidates, fitted.refined, on_device, CONFIG, fitted.exact)
-    poses = detections(candidates, choice, fitted.refined, image.part, image.scene)
+            choice, probability = reported(candidates, fitted, on_device, CONFIG)
+    poses = detections(candidates, choice, probability, image.part, image.scene)
     return Detections(image.part.name, image.scene.unit, poses, clock.timing, None, warnings)
 
 

@@ -3,9 +3,11 @@
 from kmn_jax.detection._background import BinMargins, away_from_empty, bin_content, in_front_of_empty, inside_bin
 from kmn_jax.detection._bin_program import BinPoses, BinPosesConfig, bin_poses, device_calibration
 from kmn_jax.detection._calibration import (
+    COMPANY,
     Calibration,
     CalibrationArrays,
     Probabilities,
+    company,
     expected_calibration_error,
     fit_calibration,
     load_probabilities,
@@ -45,6 +47,7 @@ from kmn_jax.detection._detect import (
     detections,
     explore,
     refined_candidates,
+    reported,
 )
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place, symmetry_transforms
 from kmn_jax.detection._estimator import PoseEstimator
@@ -76,6 +79,7 @@ from kmn_jax.detection._sources import GraspSource, MeshLike, PartSource, ScanSo
 from kmn_jax.detection._timing import Clock
 
 __all__ = [
+    "COMPANY",
     "EVIDENCE",
     "MOST_POINTS",
     "NUM_SEEDS",
@@ -124,6 +128,7 @@ __all__ = [
     "candidates_of",
     "canonical_pose",
     "chosen",
+    "company",
     "depth_agreement",
     "depth_buffer",
     "describe",
@@ -162,6 +167,7 @@ __all__ = [
     "refined",
     "refined_candidates",
     "reliability",
+    "reported",
     "same_place",
     "search_at",
     "search_crop",

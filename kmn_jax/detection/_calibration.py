@@ -180,17 +180,33 @@ def reliability(
     return [(float(probability[own].mean()), float(right[own].mean()), int(own.sum())) for own in chosen if own.any()]
 
 
+COMPANY = ("own", "others")  # the evidence of `together`, see `company`
+
+
+def company(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2"]:
+    """Return of each pose of one scene its log odds and log(1 + the sum of the odds of the others)."""
+    odds = np.exp(np.clip(logits, -50, 50))
+    return np.stack([logits, np.log1p((odds * ~np.eye(len(odds), dtype=bool)).sum(axis=1))], axis=1)
+
+
 @dataclass(frozen=True)
 class Probabilities:
     """The model of poses as they are found, which chooses among them, and that of refined ones, which is reported.
 
     `exact` is of refined poses that are right in all of their points, not on average: it tells poses of one place apart
-    that are turned against each other.
+    that are turned against each other. `together` is of poses in one scene, by what `refined` says of each: where a
+    part has been found, doubtful poses are more often right, and where all are doubtful it may not be there at all.
     """
 
     found: Calibration
     refined: Calibration
     exact: Calibration
+    together: Calibration
+
+    def of_scene(self, evidence: Float[np.ndarray, "s f"]) -> Float[np.ndarray, " s"]:
+        """Return the probabilities of all refined poses that stand in one scene; one that is alone has its own."""
+        logits = self.refined.logit(evidence)
+        return _logistic(logits) if len(logits) < 2 else self.together.probability(company(logits))
 
 
 def probabilities_bytes(probabilities: Probabilities) -> bytes:
@@ -202,12 +218,13 @@ def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
     """Read models of the evidence with the given names. Raises InputError if the file holds anything else."""
     try:
         stored = parse_json(Path(path).read_text(encoding="utf-8"))
-        models = [_read(stored[field.name]) for field in fields(Probabilities)]
+        probabilities = Probabilities(**{field.name: _read(stored[field.name]) for field in fields(Probabilities)})
     except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path} is not a readable calibration: {shown(error)}") from None
-    if any(model.names != tuple(names) for model in models):
+    expected = {field.name: COMPANY if field.name == "together" else tuple(names) for field in fields(Probabilities)}
+    if any(getattr(probabilities, name).names != columns for name, columns in expected.items()):
         raise InputError(f"{path} is a calibration of other evidence: fit it again with experiments.calibrate")
-    return Probabilities(*models)
+    return probabilities
 
 
 def _read(stored: dict[str, Any]) -> Calibration:

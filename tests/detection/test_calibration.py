@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -11,9 +12,11 @@ import numpy as np
 import pytest
 
 from kmn_jax.detection import (
+    COMPANY,
     Calibration,
     CalibrationArrays,
     Probabilities,
+    company,
     device_calibration,
     expected_calibration_error,
     fit_calibration,
@@ -108,6 +111,26 @@ def test_several_members_are_the_mean_of_their_models() -> None:
     assert losses[1] < losses[0] + 0.02
 
 
+def test_what_poses_of_one_scene_say_about_each_other() -> None:
+    logits = np.array([2.0, -1.0, 0.5])
+    columns = company(logits)
+    np.testing.assert_array_equal(columns[:, 0], logits)
+    others = [np.log1p(np.exp(np.delete(logits, row)).sum()) for row in range(3)]
+    np.testing.assert_allclose(columns[:, 1], others, rtol=1e-12)
+    # One that is all but certain hides none of what the others say about it.
+    np.testing.assert_allclose(company(np.array([60.0, 1.0]))[0, 1], np.log1p(np.e), rtol=1e-12)
+    assert np.isfinite(company(np.array([-1e4, 1e4]))).all()
+
+
+def test_a_pose_that_is_alone_keeps_its_probability() -> None:
+    own = Calibration(("x",), (1.0,), 0.0)
+    models = Probabilities(own, own, own, Calibration(COMPANY, (0.8, 0.4), -1.5))
+    assert len(models.of_scene(np.zeros((0, 1)))) == 0
+    np.testing.assert_allclose(models.of_scene(np.array([[1.2]])), own.probability(np.array([[1.2]])), rtol=1e-12)
+    doubtful, vouched = models.of_scene(np.array([[-1.0], [-2.0]])), models.of_scene(np.array([[-1.0], [6.0]]))
+    assert doubtful[0] < own.probability(np.array([[-1.0]]))[0] < vouched[0]
+
+
 def test_reliability_counts_every_pose_once() -> None:
     probability = np.array([0.0, 0.05, 0.55, 1.0])
     rows = reliability(probability, np.array([False, False, True, True]))
@@ -118,16 +141,20 @@ def test_reliability_counts_every_pose_once() -> None:
 def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.calibration.json"
     logistic = Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25)
-    fitted = Probabilities(logistic, fit_calibration(*drawn(100), NAMES), logistic)
+    together = Calibration(COMPANY, (0.8, 0.4), -1.5)
+    fitted = Probabilities(logistic, fit_calibration(*drawn(100), NAMES), logistic, together)
     path.write_bytes(probabilities_bytes(fitted))
     assert load_probabilities(path, NAMES) == fitted
     with pytest.raises(InputError, match="of other evidence"):
         load_probabilities(path, ("first",))
+    path.write_bytes(probabilities_bytes(replace(fitted, together=logistic)))
+    with pytest.raises(InputError, match="of other evidence"):
+        load_probabilities(path, NAMES)
     for content in (
         "",
         "[]",
         "{}",
-        '{"found": 1, "refined": {"names": ["first"], "weights": ["x"], "bias": 0}, "exact": 1}',
+        '{"found": 1, "refined": {"names": ["first"], "weights": ["x"], "bias": 0}, "exact": 1, "together": 1}',
         _damaged(fitted),
         probabilities_bytes(fitted).decode().replace("-2.5", f"1{'0' * 400}"),
     ):

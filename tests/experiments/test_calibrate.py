@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from experiments import calibrate
-from experiments.calibrate import Options, fit
-from kmn_jax.detection import Candidates, expected_calibration_error
+from experiments.calibrate import Options, fit, fit_together
+from kmn_jax.detection import Candidates, company, expected_calibration_error
 from kmn_jax.errors import InputError
 
 _OBJECTS, _POSES, _COLUMNS = 10, 60, 12
@@ -39,8 +39,8 @@ def few_columns(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_probabilities_hold_for_objects_of_other_kinds() -> None:
     poses = drawn(0)
     options = Options(absent_weight=1.0)
-    model, results = fit(poses, options)
-    plain, _ = fit(poses | {"reported": np.zeros(len(poses["error"]), dtype=bool)}, options)
+    model, _, results = fit(poses, options)
+    plain, _, _ = fit(poses | {"reported": np.zeros(len(poses["error"]), dtype=bool)}, options)
     assert results["summary"]["poses"] == poses["reported"].sum()
     fresh = drawn(1, 50)
     evidence, right = fresh["evidence"], fresh["error"] < 0.1
@@ -50,12 +50,38 @@ def test_probabilities_hold_for_objects_of_other_kinds() -> None:
     assert (np.diff(model.probability(evidence[order])) >= -1e-9).all()  # the scale alone is another
 
 
+def test_poses_of_scenes_where_the_part_is_vouch_for_each_other() -> None:
+    rng = np.random.default_rng(0)
+    scenes, poses = 300, 6
+    there = rng.random((scenes, 1)) < 0.5
+    right = (rng.random((scenes, poses)) < 0.6) & there
+    logits = (np.where(right, 1.5, -1.5) + 1.5 * rng.normal(size=right.shape)).reshape(-1)
+    # Of the last scenes only one pose is reported, which has nobody to vouch for it.
+    reported = np.ones(right.shape, dtype=bool)
+    reported[-50:, 1:] = False
+    rows = {
+        "error": np.where(right, 0.01, np.inf).reshape(-1),
+        "object": np.repeat(np.arange(scenes) % 10, poses),
+        "search": np.repeat(np.arange(scenes), poses),
+        "reported": reported.reshape(-1),
+    }
+    model, held_out, results = fit_together(rows, logits, Options())
+    assert model.weights[1] > 0.1
+    own, outcome = logits[rows["reported"]], rows["error"][rows["reported"]] < 0.1
+    assert results["summary"]["poses"] == len(own) == len(held_out)
+    losses = [np.logaddexp(0, np.where(outcome, -1, 1) * odds).mean() for odds in (own, held_out)]
+    assert losses[1] < 0.95 * losses[0]
+    np.testing.assert_array_equal(held_out[-50:], own[-50:])
+    first = own[:poses]
+    np.testing.assert_allclose(model.logit(company(first)), held_out[:poses], atol=0.3)  # of others' scenes
+
+
 def test_absent_parts_count_more_among_refined_poses() -> None:
     # The scale stays as it is, and much is in doubt: more poses than the model could learn by heart.
     poses = drawn(0, 25, spread=6.0) | {"reported": np.zeros(25 * _POSES, dtype=bool)}
 
     def fitted(poses: dict[str, np.ndarray], weight: float) -> np.ndarray:
-        return fit(poses, Options(absent_weight=weight, folds=2))[0].probability(poses["evidence"])
+        return fit(poses, Options(absent_weight=weight, folds=2)).model.probability(poses["evidence"])
 
     assert fitted(poses, 20).mean() < 0.8 * fitted(poses, 1).mean()
     found = drawn(0) | {"reported": np.zeros(_OBJECTS * _POSES, dtype=bool)}
