@@ -12,8 +12,10 @@ wide_long, dynamic_long
     The two that found more, trained for long: wide_long from random parameters, dynamic_long from those of `small`, as
     its parameters have the same shapes.
     Command:   python -m experiments.train wide_long, and the same with the other name
-    Hardware:  one H200.
-    Expected:  not yet known.
+    Hardware:  one H200, both side by side and beside `base_worlds`: dynamic_long 11 minutes, 3 of them until the first
+               step, at 4,200 samples/s in the median.
+    Expected:  dynamic_long: validation loss 2.163, segmentation accuracy 0.960, keypoint accuracy 0.144 of 64;
+               docs/training.md has the recalls. wide_long has not been run to its end.
 """
 
 from __future__ import annotations
@@ -64,7 +66,7 @@ def _long(name: str, **changes: object) -> TrainConfig:
     long = replace(
         of,
         name=f"{name}_long",
-        num_steps=9_000,
+        num_steps=12_000,
         optimizer=replace(of.optimizer, warmup_steps=200),
         average_decay=0.998,
         validate_every=1_500,
