@@ -8,8 +8,8 @@ model of poses as they are found is fitted first: it chooses which of them are r
 poses detection reports one for each place: the one that a third model holds for the most probable, which is fitted to
 whether all points are in their places (MSSD), and not their mean (ADI). Models are too sure of themselves about kinds
 of objects that they were not fitted to: so the scales of the refined poses' models are fitted to what detection would
-report by models that do not know the kind. From the same poses a fourth model learns what poses of one scene say about
-each other.
+report by models that do not know the kind. From the same poses, of scans of which is known where parts are, a fourth
+model learns what poses of one scene say about each other.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ from kmn_jax.report import check_target, print_table, write_json
 
 _LOOSE = DetectConfig(reported=0.03)  # refines more than detection does, so that the fit sees what is just refused
 _SCALE_RIDGE = 1e-4  # hardly any: it makes probabilities too modest
-_COLUMNS = ("evidence", "error", "largest_error", "object", "search", "refined", "reported")  # of poses
+_COLUMNS = ("evidence", "error", "largest_error", "object", "search", "narrowed", "refined", "reported")  # of poses
 _KINDS = 100  # more than the families of parts in a folder of world bins
 SHIPPED = Path(__file__).parent.parent / "kmn_jax" / "pretrained" / "small.calibration.json"
 
@@ -111,6 +111,7 @@ class Search(NamedTuple):
             "largest_error": errors[1],
             "object": np.full(len(poses), self.number),
             "search": np.full(len(poses), self.row),
+            "narrowed": np.full(len(poses), self.scene.is_narrowed),
         }
 
 
@@ -273,13 +274,17 @@ def fit(poses: dict[str, np.ndarray], options: Options) -> Fitted:
 
 
 def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: Options) -> Fitted:
-    """Fit the model of what poses that are reported of one search say about each other, given the log odds of each."""
+    """Fit the model of what reported poses of one narrowed search say about each other, given the log odds of each.
+
+    What is judged are all reported poses, of which those of other searches, and those that are alone, keep their odds.
+    """
     logits = logits[poses["reported"]]
     poses = {name: values[poses["reported"]] for name, values in poses.items()}
-    right, columns, alone = poses["error"] < THRESHOLD, np.zeros((len(logits), 2)), np.zeros(len(logits), dtype=bool)
+    right, columns, together = poses["error"] < THRESHOLD, np.zeros((len(logits), 2)), poses["narrowed"].copy()
     for search in np.unique(poses["search"]):
         rows = np.flatnonzero(poses["search"] == search)
-        columns[rows], alone[rows] = company(logits[rows]), len(rows) == 1
+        columns[rows] = company(logits[rows])
+        together[rows] &= len(rows) > 1
 
     def model_of(rows: Bool[np.ndarray, " s"]) -> Calibration:
         return fit_calibration(columns[rows], right[rows], COMPANY, hidden_units=0, ridge=_SCALE_RIDGE)
@@ -287,8 +292,8 @@ def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], 
     held_out = logits.copy()
     for names in _folds(poses, options):
         own = np.isin(poses["object"], names)
-        held_out[own & ~alone] = model_of(~own & ~alone).logit(columns[own & ~alone])
-    return Fitted(model_of(~alone), held_out, _judged(poses, held_out))
+        held_out[own & together] = model_of(~own & together).logit(columns[own & together])
+    return Fitted(model_of(together), held_out, _judged(poses, held_out))
 
 
 def _judged(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"]) -> dict[str, Any]:

@@ -230,7 +230,7 @@ def _found(name: str, model: Model, fitted: Probabilities, image: BinImage) -> D
     if len(rows):
         with clock("refinement"):
             candidates = refined_candidates(on_device, image.scene, candidates, rows, 0, CONFIG.search)
-            choice, probability = reported(candidates, fitted, on_device, CONFIG)
+            choice, probability = reported(candidates, fitted, on_device, CONFIG, image.scene.is_narrowed)
     poses = detections(candidates, choice, probability, image.part, image.scene)
     return Detections(image.part.name, image.scene.unit, poses, clock.timing, None, warnings)
 

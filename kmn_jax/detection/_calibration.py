@@ -194,8 +194,9 @@ class Probabilities:
     """The model of poses as they are found, which chooses among them, and that of refined ones, which is reported.
 
     `exact` is of refined poses that are right in all of their points, not on average: it tells poses of one place apart
-    that are turned against each other. `together` is of poses in one scene, by what `refined` says of each: where a
-    part has been found, doubtful poses are more often right, and where all are doubtful it may not be there at all.
+    that are turned against each other. `together` is of poses in one scene of which was said where parts are, by what
+    `refined` says of each: if some are sure, doubtful ones are more often right, and if none is the part may not be
+    there at all. Anywhere else poses tell little about each other: there are walls, and other parts, to be mistaken.
     """
 
     found: Calibration
@@ -203,10 +204,10 @@ class Probabilities:
     exact: Calibration
     together: Calibration
 
-    def of_scene(self, evidence: Float[np.ndarray, "s f"]) -> Float[np.ndarray, " s"]:
+    def of_scene(self, evidence: Float[np.ndarray, "s f"], is_narrowed: bool) -> Float[np.ndarray, " s"]:
         """Return the probabilities of all refined poses that stand in one scene; one that is alone has its own."""
         logits = self.refined.logit(evidence)
-        return _logistic(logits) if len(logits) < 2 else self.together.probability(company(logits))
+        return self.together.probability(company(logits)) if is_narrowed and len(logits) > 1 else _logistic(logits)
 
 
 def probabilities_bytes(probabilities: Probabilities) -> bytes:

@@ -68,7 +68,7 @@ class DetectConfig:
     later_seeds: int = 16  # at most in a round after the first; rounds go on until the foreground is covered
     most_seeds: int = 512  # at least so many are searched before it is given up to cover the foreground
     likely: float = 0.5  # the probability from which on a pose, as it is found, explains points: they are done
-    accepted: float = 0.7  # from which on a pose counts as found: over 95% are right, fewer than 1 in 20 scenes in vain
+    accepted: float = 0.8  # that from which on a pose counts as found: in world bins 95% of such poses are right
     reported: float = 0.1  # less probable poses are left out
 
     def __post_init__(self) -> None:
@@ -126,7 +126,7 @@ def detect(
             rows = np.flatnonzero(choice.kept | choice.contenders)
             found = refined_candidates(on_device, scene, found, rows, random_seed, search)
         with clock("selection"):
-            choice, probability = reported(found, probabilities, on_device, config)
+            choice, probability = reported(found, probabilities, on_device, config, scene.is_narrowed)
     with clock("report"):
         poses = detections(found, choice, probability, part, scene)
         accepted = choice.kept & (probability >= config.accepted)
@@ -269,12 +269,12 @@ def chosen(
 
 
 def reported(
-    refined: Candidates, probabilities: Probabilities, part: DevicePart, config: DetectConfig
+    refined: Candidates, probabilities: Probabilities, part: DevicePart, config: DetectConfig, is_narrowed: bool
 ) -> tuple[Selection, Float[np.ndarray, " s"]]:
     """Choose among refined candidates, and return also how probable those that stand are, given each other."""
     choice = chosen(refined, probabilities.refined, part, config, probabilities.exact)
     probability = np.zeros(len(choice.kept))
-    probability[choice.kept] = probabilities.of_scene(refined.evidence[choice.kept])
+    probability[choice.kept] = probabilities.of_scene(refined.evidence[choice.kept], is_narrowed)
     return choice._replace(kept=choice.kept & (probability >= config.reported)), probability
 
 

@@ -122,13 +122,15 @@ def test_what_poses_of_one_scene_say_about_each_other() -> None:
     assert np.isfinite(company(np.array([-1e4, 1e4]))).all()
 
 
-def test_a_pose_that_is_alone_keeps_its_probability() -> None:
+def test_poses_that_nothing_vouches_for_keep_their_probabilities() -> None:
     own = Calibration(("x",), (1.0,), 0.0)
     models = Probabilities(own, own, own, Calibration(COMPANY, (0.8, 0.4), -1.5))
-    assert len(models.of_scene(np.zeros((0, 1)))) == 0
-    np.testing.assert_allclose(models.of_scene(np.array([[1.2]])), own.probability(np.array([[1.2]])), rtol=1e-12)
-    doubtful, vouched = models.of_scene(np.array([[-1.0], [-2.0]])), models.of_scene(np.array([[-1.0], [6.0]]))
-    assert doubtful[0] < own.probability(np.array([[-1.0]]))[0] < vouched[0]
+    assert len(models.of_scene(np.zeros((0, 1)), True)) == 0
+    alone, doubtful, vouched = np.array([[1.2]]), np.array([[-1.0], [-2.0]]), np.array([[-1.0], [6.0]])
+    for evidence, is_narrowed in ((alone, True), (alone, False), (doubtful, False), (vouched, False)):
+        np.testing.assert_allclose(models.of_scene(evidence, is_narrowed), own.probability(evidence), rtol=1e-12)
+    among_doubtful, among_sure = models.of_scene(doubtful, True)[0], models.of_scene(vouched, True)[0]
+    assert among_doubtful < own.probability(doubtful)[0] < among_sure
 
 
 def test_reliability_counts_every_pose_once() -> None:

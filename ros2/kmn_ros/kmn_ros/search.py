@@ -22,7 +22,7 @@ class Settings:
     depth_unit: float = 0.0  # metres of one step of the depth image; 0: as its encoding has it
     on_demand: bool = False  # search when the service is called, not every scan
     wait: float = 5.0  # seconds in which a service waits for a scan
-    min_probability: float = 0.7  # of poses that are published
+    min_probability: float = 0.8  # of poses that are published
     roi: str = ""  # as in kmn detect --roi, in metres, in the scans' frame
     plane: str = "auto"  # or always, never
     frame: str = ""  # that scans are in, in place of the one in their headers

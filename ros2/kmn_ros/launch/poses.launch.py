@@ -11,7 +11,7 @@ TOPICS = {
     "camera_info": "/camera/depth/camera_info",
     "points": "/camera/depth/points",
 }
-PARAMETERS = {"part": None, "input": "depth", "min_probability": "0.7", "on_demand": "false"}
+PARAMETERS = {"part": None, "input": "depth", "min_probability": "0.8", "on_demand": "false"}
 TYPES = {"min_probability": float, "on_demand": bool}  # all others are text
 
 
