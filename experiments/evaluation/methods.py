@@ -28,13 +28,19 @@ from kmn_jax.errors import InputError
 from kmn_jax.geometry import Crop
 from kmn_jax.models import Model
 from kmn_jax.objects import ObjectModel, Part, PartArrays, arrays_of, make_part, model_digest
-from kmn_jax.pose import Matches, RansacConfig
+from kmn_jax.pose import MatchConfig, Matches, RansacConfig
 
-# The published scheme after the same smoothing: one draw of points, one search, and its best pose is taken. The gate of
-# normals, published as 30 degrees, is wider, as a keypoint near an edge is also that of points on the next face.
+# The published scheme after the same smoothing: one draw of points, votes of those that the network takes for the
+# object, one search, and its best pose is taken. The gate of normals, published as 30 degrees, is wider, as a keypoint
+# near an edge is also that of points on the next face.
 _GATE = CropSearchConfig().ransac.normal_gate_degrees
 ONE_RANSAC = CropSearchConfig(
-    num_draws=1, num_modes=1, num_poses=1, ransac=RansacConfig(normal_gate_degrees=_GATE), icp=None
+    num_draws=1,
+    num_modes=1,
+    num_poses=1,
+    matches=MatchConfig(capacity=1024),
+    ransac=RansacConfig(normal_gate_degrees=_GATE),
+    icp=None,
 )
 
 

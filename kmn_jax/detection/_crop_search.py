@@ -67,7 +67,7 @@ class CropSearchConfig:
     num_points: int | None = None  # of a draw; unless given, by the network: see `of_network`
     crop_points: int = 4096  # of the crop at least, from which normals are estimated
     smooth: SmoothConfig | None = field(default_factory=SmoothConfig)
-    matches: MatchConfig = field(default_factory=lambda: MatchConfig(capacity=1024))
+    matches: MatchConfig = field(default_factory=lambda: MatchConfig(capacity=1024, least_points=40))
     ransac: RansacConfig = field(
         default_factory=lambda: RansacConfig(num_hypotheses=500, num_candidates=8192, normal_gate_degrees=60.0)
     )

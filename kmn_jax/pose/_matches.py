@@ -41,6 +41,7 @@ class MatchConfig:
     vote_threshold: float = 0.7  # a point votes for each keypoint that scores this share of its best one
     softmax: Literal["keypoints", "points"] = "keypoints"  # along which scores are 1 in sum; the authors' code: points
     capacity: int = 4096  # matches kept at most, the most trusted ones
+    least_points: int = 0  # so many points vote in any case, those that are most like the object; published: 0
 
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
@@ -49,6 +50,7 @@ class MatchConfig:
             self.softmax in ("keypoints", "points"), f"softmax is {self.softmax!r}, but must be 'keypoints' or 'points'"
         )
         require(self.capacity >= 3, f"capacity is {self.capacity}, but a pose needs at least 3 matches")
+        require(self.least_points >= 0, f"least_points is {self.least_points}, but must be 0 or more")
 
 
 def find_matches(
@@ -66,10 +68,11 @@ def find_matches(
 
     A scene point whose object logit (column 1) exceeds its background logit (column 0) is matched with every
     keypoint (k, 3) whose softmax score over the keypoints is at least `vote_threshold` times its best one (the paper's
-    rule; with `softmax` "points", scores are those over the points, as in the authors' code). The
-    weight of a match is that score times the softmax score of the object class. Points where `mask` (n,) is
-    false never vote; neither do, under a trace, points with values that are not finite, for which outside
-    of one InputError is raised, as it is for wrong shapes and dtypes. No vote at all is a mask without a true.
+    rule; with `softmax` "points", scores are those over the points, as in the authors' code). The weight of a match is
+    that score times the softmax score of the object class. With `least_points`, so many points vote though the network
+    takes them for background. Points where `mask` (n,) is false never vote; neither do, under a trace, points with
+    values that are not finite, for which outside of one InputError is raised, as it is for wrong shapes and dtypes. No
+    vote at all is a mask without a true.
     """
     keypoint_logits = float_array(keypoint_logits, "keypoint_logits", (None, None), finite=False)
     n, k = keypoint_logits.shape
@@ -107,7 +110,11 @@ def _find_matches(
     segmentation_logits = jnp.where(mask[:, None], segmentation_logits, 0)
     keypoint_logits = jnp.where(mask[:, None], keypoint_logits, 0)
 
-    is_object = mask & (segmentation_logits[:, OBJECT_CLASS] > segmentation_logits[:, 1 - OBJECT_CLASS])
+    margins = segmentation_logits[:, OBJECT_CLASS] - segmentation_logits[:, 1 - OBJECT_CLASS]
+    is_object = mask & (margins > 0)
+    if config.least_points:
+        likest, _ = largest(jnp.where(mask, margins, -jnp.inf), min(config.least_points, n))
+        is_object = mask & ((margins > 0) | (margins >= likest.min()))
     if config.softmax == "points":
         keypoint_logits = jax.nn.log_softmax(jnp.where(mask[:, None], keypoint_logits, -jnp.inf), axis=0)
         keypoint_logits = jnp.where(mask[:, None], keypoint_logits, 0)

@@ -76,6 +76,27 @@ def test_nothing_segmented_gives_no_pose():
     np.testing.assert_array_equal(result.T_scene_object, np.eye(4))
 
 
+@pytest.mark.parametrize("least", [1, 7, N, N + 5])
+def test_points_most_like_the_object_vote_though_all_are_background(least):
+    case = make_case()
+    background = np.asarray(case[0]) - [0.0, 100.0]
+    hidden = np.arange(N) % 4 == 0  # padding never votes, and does not take the place of what could
+    config = MatchConfig(vote_threshold=1.0, capacity=300, least_points=least)
+    matches = find_matches(background, *case[1:], mask=~hidden, config=config)
+    margins = np.where(hidden, -np.inf, background[:, 1] - background[:, 0])
+    expected = np.argsort(-margins)[: min(least, (~hidden).sum())]
+    voting = np.asarray(matches.scene_points)[np.asarray(matches.mask)]
+    assert {tuple(point) for point in voting} == {tuple(point) for point in np.asarray(case[2])[expected]}
+
+
+def test_where_enough_points_vote_no_others_do():
+    case = make_case()
+    voting = int((case[0][:, 1] > case[0][:, 0]).sum())
+    own, more = (find_matches(*case, config=MatchConfig(least_points=least)) for least in (0, voting))
+    for before, after in zip(own, more, strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
 @pytest.mark.parametrize("softmax", ["keypoints", "points"])
 def test_points_that_are_not_real_change_nothing(softmax):
     case, config = make_case(), MatchConfig(softmax=softmax)
@@ -143,7 +164,9 @@ def test_bad_input_is_named():
         find_matches(*case, mask=np.ones(N, np.int32))
 
 
-@pytest.mark.parametrize("change", [{"vote_threshold": 0.0}, {"vote_threshold": 1.5}, {"capacity": 2}])
+@pytest.mark.parametrize(
+    "change", [{"vote_threshold": 0.0}, {"vote_threshold": 1.5}, {"capacity": 2}, {"least_points": -1}]
+)
 def test_config_refuses_contradictions(change):
     with pytest.raises(ValueError, match=next(iter(change))):
         MatchConfig(**change)
