@@ -52,6 +52,7 @@ from kmn_jax.detection import (
     refined_candidates,
     search_at,
     seeds_over,
+    vouched,
 )
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
@@ -244,10 +245,10 @@ def _weights(poses: dict[str, np.ndarray], options: Options) -> Float[np.ndarray
 
 
 class Fitted(NamedTuple):
-    """The model of all poses, and how well models predict the objects that they were not fitted to."""
+    """A model, and how well models predict the objects that they were not fitted to."""
 
     model: Calibration
-    held_out: Float[np.ndarray, " s"]  # log odds of all poses by models that do not know their object
+    held_out: Float[np.ndarray, " s"]  # log odds of the poses by models that do not know their object
     results: dict[str, Any]
 
 
@@ -277,6 +278,7 @@ def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], 
     """Fit the model of what reported poses of one narrowed search say about each other, given the log odds of each.
 
     What is judged are all reported poses, of which those of other searches, and those that are alone, keep their odds.
+    Raises InputError if no two poses are reported of one such search.
     """
     logits = logits[poses["reported"]]
     poses = {name: values[poses["reported"]] for name, values in poses.items()}
@@ -285,14 +287,20 @@ def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], 
         rows = np.flatnonzero(poses["search"] == search)
         columns[rows] = company(logits[rows])
         together[rows] &= len(rows) > 1
+    if not together.any():
+        raise InputError("in no image of the bins are two poses reported: give more bins")
 
     def model_of(rows: Bool[np.ndarray, " s"]) -> Calibration:
         return fit_calibration(columns[rows], right[rows], COMPANY, hidden_units=0, ridge=_SCALE_RIDGE)
 
     held_out = logits.copy()
     for names in _folds(poses, options):
-        own = np.isin(poses["object"], names)
-        held_out[own & together] = model_of(~own & together).logit(columns[own & together])
+        own = together & np.isin(poses["object"], names)
+        if own.any():
+            others = model_of(together & ~own)
+            for search in np.unique(poses["search"][own]):
+                rows = np.flatnonzero(poses["search"] == search)
+                held_out[rows] = vouched(logits[rows], others)
     return Fitted(model_of(together), held_out, _judged(poses, held_out))
 
 
@@ -318,7 +326,8 @@ def _made_of(options: Options, model: Model) -> str:
     """Say what candidates are made of."""
     folders = [str(folder) for folder in (options.bins, options.worlds, options.known_worlds)]
     settings = DetectConfig().search_of(model.config)
-    return repr((options.method, folders, options.every, model_digest(model), EVIDENCE, settings))
+    fits = options.folds, options.members, options.absent_weight  # which decide what is reported
+    return repr((options.method, folders, options.every, fits, model_digest(model), EVIDENCE, settings))
 
 
 def calibrate(options: Options) -> dict[str, Any]:

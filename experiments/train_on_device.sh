@@ -43,7 +43,7 @@ end() {
 pack() { # FOLDER
   mkdir -p "$1"
   rm -f "$1"/runs.tar.*
-  { find runs logs -type f ! -path '*/checkpoints/*' && cat; } | { tar c -T - || [ $? = 1 ]; } | # 1: a file grew
+  { find runs logs -type f ! -path '*/checkpoints/*' ! -name '.*' && cat; } | { tar c -T - || [ $? = 1 ]; } | # 1: a file grew
     split -b 15500000 - "$1/runs.tar."
 }
 

@@ -13,6 +13,7 @@ from kmn_jax.detection._calibration import (
     load_probabilities,
     probabilities_bytes,
     reliability,
+    vouched,
 )
 from kmn_jax.detection._canonical import canonical_pose
 from kmn_jax.detection._crop_search import (
@@ -182,6 +183,7 @@ __all__ = [
     "surface_scores",
     "symmetry_transforms",
     "table",
+    "vouched",
     "warnings_once",
     "with_grasps",
     "write_bop_csv",

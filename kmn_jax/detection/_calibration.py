@@ -180,13 +180,12 @@ def reliability(
     return [(float(probability[own].mean()), float(right[own].mean()), int(own.sum())) for own in chosen if own.any()]
 
 
-COMPANY = ("own", "others")  # the evidence of `together`, see `company`
+COMPANY = ("own", "best")  # the evidence of `together`, see `company`
 
 
 def company(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2"]:
-    """Return of each pose of one scene its log odds and log(1 + the sum of the odds of the others)."""
-    odds = np.exp(np.clip(logits, -50, 50))
-    return np.stack([logits, np.log1p((odds * ~np.eye(len(odds), dtype=bool)).sum(axis=1))], axis=1)
+    """Return of each pose of one scene its log odds, and those of the most probable pose there."""
+    return np.stack([logits, np.full_like(logits, logits.max(initial=-np.inf))], axis=1)
 
 
 @dataclass(frozen=True)
@@ -195,8 +194,8 @@ class Probabilities:
 
     `exact` is of refined poses that are right in all of their points, not on average: it tells poses of one place apart
     that are turned against each other. `together` is of poses in one scene of which was said where parts are, by what
-    `refined` says of each: if some are sure, doubtful ones are more often right, and if none is the part may not be
-    there at all. Anywhere else poses tell little about each other: there are walls, and other parts, to be mistaken.
+    `refined` says of each: if one is sure, doubtful ones are more often right. Anywhere else poses tell little about
+    each other: there are walls, and other parts, to be mistaken.
     """
 
     found: Calibration
@@ -205,9 +204,18 @@ class Probabilities:
     together: Calibration
 
     def of_scene(self, evidence: Float[np.ndarray, "s f"], is_narrowed: bool) -> Float[np.ndarray, " s"]:
-        """Return the probabilities of all refined poses that stand in one scene; one that is alone has its own."""
+        """Return the probabilities of all refined poses that stand in one scene."""
         logits = self.refined.logit(evidence)
-        return self.together.probability(company(logits)) if is_narrowed and len(logits) > 1 else _logistic(logits)
+        return _logistic(vouched(logits, self.together) if is_narrowed else logits)
+
+
+def vouched(logits: Float[np.ndarray, " s"], together: Calibration) -> Float[np.ndarray, " s"]:
+    """Return the log odds of poses that vouch for each other: none has less than alone, and their order stays.
+
+    That doubtful poses speak against each other is left out: so they do in full bins, which are what is fitted to, but
+    not where the last copy lies.
+    """
+    return np.maximum(logits, together.logit(company(logits))) if len(logits) > 1 else logits
 
 
 def probabilities_bytes(probabilities: Probabilities) -> bytes:
@@ -217,15 +225,15 @@ def probabilities_bytes(probabilities: Probabilities) -> bytes:
 
 def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
     """Read models of the evidence with the given names. Raises InputError if the file holds anything else."""
+    evidence = {field.name: COMPANY if field.name == "together" else tuple(names) for field in fields(Probabilities)}
     try:
         stored = parse_json(Path(path).read_text(encoding="utf-8"))
-        probabilities = Probabilities(**{field.name: _read(stored[field.name]) for field in fields(Probabilities)})
+        models = {name: _read(stored[name]) for name in evidence if name == "found" or name in stored}
     except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path} is not a readable calibration: {shown(error)}") from None
-    expected = {field.name: COMPANY if field.name == "together" else tuple(names) for field in fields(Probabilities)}
-    if any(getattr(probabilities, name).names != columns for name, columns in expected.items()):
+    if {name: model.names for name, model in models.items()} != evidence:
         raise InputError(f"{path} is a calibration of other evidence: fit it again with experiments.calibrate")
-    return probabilities
+    return Probabilities(**models)
 
 
 def _read(stored: dict[str, Any]) -> Calibration:

@@ -275,7 +275,7 @@ def reported(
     choice = chosen(refined, probabilities.refined, part, config, probabilities.exact)
     probability = np.zeros(len(choice.kept))
     probability[choice.kept] = probabilities.of_scene(refined.evidence[choice.kept], is_narrowed)
-    return choice._replace(kept=choice.kept & (probability >= config.reported)), probability
+    return choice, probability
 
 
 def detections(
@@ -283,17 +283,20 @@ def detections(
 ) -> tuple[Detection, ...]:
     """Return the poses that stand as plain records in the scene's frame, in pick order."""
     poses = [
-        _detection(row, float(probability[row]), float(choice.gap[row]), found, part, scene)
+        _detection(row, float(probability[row]), choice, found, part, scene)
         for row in np.flatnonzero(choice.kept).tolist()
     ]
     return tuple(sorted(poses, key=lambda pose: -pose.probability * pose.visible_fraction))
 
 
-def _detection(row: int, probability: float, gap: float, found: Candidates, part: Part, scene: Scene) -> Detection:
+def _detection(
+    row: int, probability: float, choice: Selection, found: Candidates, part: Part, scene: Scene
+) -> Detection:
     pose = canonical_pose(scene.T_scene_camera @ found.T_camera_object[row].astype(np.float64), part.symmetries)
     shares: dict[str, Any] = {name: float(found.evidence[row, EVIDENCE.index(name)]) for name in _SHARES}
     prediction = crop_prediction(found, row)
-    notes = ((_SYMMETRIC, part.is_symmetric), (_RIVALLED, gap < _CLOSE_GAP))
+    gap = float(choice.gap[row])
+    notes = ((_SYMMETRIC, part.is_symmetric), (_RIVALLED, bool(choice.rivalled[row]) and gap < _CLOSE_GAP))
     return Detection(
         T_scene_object=pose,
         probability=probability,

@@ -53,7 +53,7 @@ class Detection:
     probability: float  # of being correct: ADI below a tenth of the diameter, see docs/detect.md
     num_inliers: int  # matches of scene points with keypoints that agree on the pose
     visible_fraction: float  # share that nothing measured hides
-    runner_up_gap: float  # by how much the best other pose at this place is less probable
+    runner_up_gap: float  # by how much the best other pose at this place has less probably all points in theirs
     explained: float  # share that was measured where the pose predicts it
     violated: float  # share that the sensor saw through
     occluded: float  # share that something measured hides

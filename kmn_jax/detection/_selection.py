@@ -28,6 +28,7 @@ class Selection(NamedTuple):
 
     kept: Bool[Array, " s"]
     gap: Float[Array, " s"]  # of what is kept; the score itself where nothing competes
+    rivalled: Bool[Array, " s"]  # whether something competes
     contenders: Bool[Array, " s"]  # the best other pose for the place of each that is kept, if nearly as good
 
 
@@ -69,11 +70,12 @@ def select(
     better = (clash & (score[:, None] > score[None])).astype(jnp.int32)
     alone = better.sum(axis=0)[None] == better
     beaten = one_each & ~kept
-    gap = score - jnp.where(clash & beaten[None] & alone, score[None], 0).max(axis=1, initial=0)
+    rivals = clash & beaten[None] & alone
+    gap = score - jnp.where(rivals, score[None], 0).max(axis=1, initial=0)
     others = jnp.where(clash & beaten[None], score[None], -jnp.inf)
     contested = kept & (others.max(axis=1) >= score - contest)
     contenders = jnp.zeros_like(kept).at[others.argmax(axis=1)].max(contested)
-    return Selection(kept, gap, contenders)
+    return Selection(kept, gap, rivals.any(axis=1), contenders)
 
 
 def _greedy(

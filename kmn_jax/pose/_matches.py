@@ -41,7 +41,7 @@ class MatchConfig:
     vote_threshold: float = 0.7  # a point votes for each keypoint that scores this share of its best one
     softmax: Literal["keypoints", "points"] = "keypoints"  # along which scores are 1 in sum; the authors' code: points
     capacity: int = 4096  # matches kept at most, the most trusted ones
-    least_points: int = 0  # so many points vote in any case, those that are most like the object; published: 0
+    least_points: int = 0  # so many points vote at least, those that are most like the object; published: 0
 
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
@@ -69,10 +69,10 @@ def find_matches(
     A scene point whose object logit (column 1) exceeds its background logit (column 0) is matched with every
     keypoint (k, 3) whose softmax score over the keypoints is at least `vote_threshold` times its best one (the paper's
     rule; with `softmax` "points", scores are those over the points, as in the authors' code). The weight of a match is
-    that score times the softmax score of the object class. With `least_points`, so many points vote though the network
-    takes them for background. Points where `mask` (n,) is false never vote; neither do, under a trace, points with
-    values that are not finite, for which outside of one InputError is raised, as it is for wrong shapes and dtypes. No
-    vote at all is a mask without a true.
+    that score times the softmax score of the object class. If fewer than `least_points` are the object's, so many vote
+    in all: those whose object logits exceed the others by most. Points where `mask` (n,) is false never vote; neither
+    do, under a trace, points with values that are not finite, for which outside of one InputError is raised, as it is
+    for wrong shapes and dtypes. No vote at all is a mask without a true.
     """
     keypoint_logits = float_array(keypoint_logits, "keypoint_logits", (None, None), finite=False)
     n, k = keypoint_logits.shape

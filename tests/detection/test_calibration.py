@@ -16,7 +16,6 @@ from kmn_jax.detection import (
     Calibration,
     CalibrationArrays,
     Probabilities,
-    company,
     device_calibration,
     expected_calibration_error,
     fit_calibration,
@@ -111,26 +110,22 @@ def test_several_members_are_the_mean_of_their_models() -> None:
     assert losses[1] < losses[0] + 0.02
 
 
-def test_what_poses_of_one_scene_say_about_each_other() -> None:
-    logits = np.array([2.0, -1.0, 0.5])
-    columns = company(logits)
-    np.testing.assert_array_equal(columns[:, 0], logits)
-    others = [np.log1p(np.exp(np.delete(logits, row)).sum()) for row in range(3)]
-    np.testing.assert_allclose(columns[:, 1], others, rtol=1e-12)
-    # One that is all but certain hides none of what the others say about it.
-    np.testing.assert_allclose(company(np.array([60.0, 1.0]))[0, 1], np.log1p(np.e), rtol=1e-12)
-    assert np.isfinite(company(np.array([-1e4, 1e4]))).all()
-
-
-def test_poses_that_nothing_vouches_for_keep_their_probabilities() -> None:
+def test_sure_poses_vouch_for_others_of_their_scene() -> None:
     own = Calibration(("x",), (1.0,), 0.0)
-    models = Probabilities(own, own, own, Calibration(COMPANY, (0.8, 0.4), -1.5))
+    models = Probabilities(own, own, own, Calibration(COMPANY, (1.1, 1.15), -4.8))
+    rng = np.random.default_rng(0)
     assert len(models.of_scene(np.zeros((0, 1)), True)) == 0
-    alone, doubtful, vouched = np.array([[1.2]]), np.array([[-1.0], [-2.0]]), np.array([[-1.0], [6.0]])
-    for evidence, is_narrowed in ((alone, True), (alone, False), (doubtful, False), (vouched, False)):
-        np.testing.assert_allclose(models.of_scene(evidence, is_narrowed), own.probability(evidence), rtol=1e-12)
-    among_doubtful, among_sure = models.of_scene(doubtful, True)[0], models.of_scene(vouched, True)[0]
-    assert among_doubtful < own.probability(doubtful)[0] < among_sure
+    for count in (1, 2, 3, 12):
+        evidence = 3 * rng.normal(size=(count, 1))
+        alone = own.probability(evidence)
+        np.testing.assert_allclose(models.of_scene(evidence, False), alone, rtol=1e-12)
+        together = models.of_scene(evidence, True)
+        assert (together >= alone).all()
+        assert (np.diff(together[np.argsort(alone, kind="stable")]) >= 0).all()  # the order stays
+    np.testing.assert_allclose(models.of_scene(np.array([[1.2]]), True), own.probability(np.array([[1.2]])), rtol=1e-12)
+    doubtful, with_a_sure_one = np.array([[-1.0], [-2.0]]), np.array([[-1.0], [6.0]])
+    np.testing.assert_allclose(models.of_scene(doubtful, True), own.probability(doubtful), rtol=1e-12)
+    assert models.of_scene(with_a_sure_one, True)[0] > 2 * own.probability(doubtful)[0]
 
 
 def test_reliability_counts_every_pose_once() -> None:
@@ -143,7 +138,7 @@ def test_reliability_counts_every_pose_once() -> None:
 def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.calibration.json"
     logistic = Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25)
-    together = Calibration(COMPANY, (0.8, 0.4), -1.5)
+    together = Calibration(COMPANY, (1.1, 1.2), -4.8)
     fitted = Probabilities(logistic, fit_calibration(*drawn(100), NAMES), logistic, together)
     path.write_bytes(probabilities_bytes(fitted))
     assert load_probabilities(path, NAMES) == fitted
@@ -151,6 +146,11 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
         load_probabilities(path, ("first",))
     path.write_bytes(probabilities_bytes(replace(fitted, together=logistic)))
     with pytest.raises(InputError, match="of other evidence"):
+        load_probabilities(path, NAMES)
+    old = json.loads(probabilities_bytes(fitted))
+    del old["exact"], old["together"]
+    path.write_text(json.dumps(old))
+    with pytest.raises(InputError, match="fit it again"):
         load_probabilities(path, NAMES)
     for content in (
         "",

@@ -148,6 +148,7 @@ def test_one_pose_an_instance_is_kept_and_rivals_for_its_place_make_the_gap(firs
     np.testing.assert_array_equal(found.kept, [first == 0, first == 1, False, True])
     np.testing.assert_allclose(found.gap[first], 0.95 - 0.7, rtol=1e-5)  # not the other form of itself
     np.testing.assert_allclose(found.gap[3], 0.6, rtol=1e-5)
+    assert np.flatnonzero(found.rivalled & found.kept).tolist() == [first]
     assert not found.contenders.any()
     close = chosen(poses, score, contest=0.3)
     np.testing.assert_array_equal(close.contenders, [False, False, True, False])
