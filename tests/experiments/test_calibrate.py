@@ -38,7 +38,7 @@ def few_columns(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_probabilities_hold_for_objects_of_other_kinds() -> None:
     poses = drawn(0)
-    options = Options(absent_weight=1.0)
+    options = Options(absent_weight=1.0, members=2)
     model, _, results = fit(poses, options)
     plain, _, _ = fit(poses | {"reported": np.zeros(len(poses["error"]), dtype=bool)}, options)
     assert results["summary"]["poses"] == poses["reported"].sum()
@@ -87,7 +87,7 @@ def test_absent_parts_count_more_among_refined_poses() -> None:
     poses = drawn(0, 25, spread=6.0) | {"reported": np.zeros(25 * _POSES, dtype=bool)}
 
     def fitted(poses: dict[str, np.ndarray], weight: float) -> np.ndarray:
-        return fit(poses, Options(absent_weight=weight, folds=2)).model.probability(poses["evidence"])
+        return fit(poses, Options(absent_weight=weight, folds=2, members=2)).model.probability(poses["evidence"])
 
     assert fitted(poses, 20).mean() < 0.8 * fitted(poses, 1).mean()
     found = drawn(0) | {"reported": np.zeros(_OBJECTS * _POSES, dtype=bool)}
@@ -127,4 +127,4 @@ def test_where_probable_poses_are_wrong_no_scale_is_fitted() -> None:
     poses["evidence"] = np.outer(np.where(right, 1.0, -1.0) * turned, np.ones(_COLUMNS))
     poses["object"] = poses["object"] % 2
     with pytest.raises(InputError, match="give more bins"):
-        fit(poses, Options(absent_weight=1.0, folds=2))
+        fit(poses, Options(absent_weight=1.0, folds=2, members=2))
