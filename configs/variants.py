@@ -45,11 +45,14 @@ def _variant(name: str, **changes: object) -> TrainConfig:
     )
 
 
+_WIDE = _variant("wide", edge_width=64, embedding_width=1_024, scene_width=512, object_width=128, pair_width=256)
+_DYNAMIC = _variant("dynamic", graph="dynamic")
+
 VARIANTS = (
     _variant("reference"),
     _variant("points_1024", num_scene_points=1_024),
-    _variant("wide", edge_width=64, embedding_width=1_024, scene_width=512, object_width=128, pair_width=256),
-    _variant("dynamic", graph="dynamic"),
+    _WIDE,
+    _DYNAMIC,
     _variant("keypoints_20", num_keypoints=20),
     _variant("keypoints_128", num_keypoints=128),
     _variant("keypoints_512", num_keypoints=512),
@@ -58,20 +61,16 @@ VARIANTS = (
     _variant("narrow", edge_width=16, embedding_width=256, scene_width=128, object_width=32, pair_width=64),
 )
 
-_NAMED = {variant.name: variant for variant in VARIANTS}
 
-
-def _long(name: str, **changes: object) -> TrainConfig:
-    of = _NAMED[f"variant_{name}"]
-    long = replace(
+def _long(of: TrainConfig, name: str) -> TrainConfig:
+    return replace(
         of,
-        name=f"{name}_long",
+        name=name,
         num_steps=12_000,
         optimizer=replace(of.optimizer, warmup_steps=200),
         average_decay=0.998,
         validate_every=1_500,
     )
-    return replace(long, **changes)  # type: ignore[arg-type]
 
 
-LONG = (_long("wide"), _long("dynamic", warm_start="small"))
+LONG = (_long(_WIDE, "wide_long"), replace(_long(_DYNAMIC, "dynamic_long"), warm_start="small"))

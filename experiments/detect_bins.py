@@ -225,12 +225,13 @@ def _found(name: str, model: Model, fitted: Probabilities, image: BinImage) -> D
     candidates, warnings = explore(image.scene, image.part, propose, fitted.found, CONFIG, clock)
     with clock("selection"):
         choice = chosen(candidates, fitted.found, on_device, CONFIG)
-    probability = fitted.found.probability(candidates.evidence)
     rows = np.flatnonzero(choice.kept | choice.contenders)
     if len(rows):
         with clock("refinement"):
             candidates = refined_candidates(on_device, image.scene, candidates, rows, 0, CONFIG.search)
             choice, probability = reported(candidates, fitted, on_device, CONFIG, image.scene.is_narrowed)
+    else:
+        probability = fitted.found.probability(candidates.evidence)
     poses = detections(candidates, choice, probability, image.part, image.scene)
     return Detections(image.part.name, image.scene.unit, poses, clock.timing, None, warnings)
 

@@ -120,13 +120,14 @@ def detect(
             found = found._replace(usable=found.usable & found.is_first)
     with clock("selection"):
         choice = chosen(found, probabilities.found, on_device, config)
-    probability = probabilities.found.probability(found.evidence)
     if at is None and choice.kept.any():
         with clock("refinement"):
             rows = np.flatnonzero(choice.kept | choice.contenders)
             found = refined_candidates(on_device, scene, found, rows, random_seed, search)
         with clock("selection"):
             choice, probability = reported(found, probabilities, on_device, config, scene.is_narrowed)
+    else:
+        probability = probabilities.found.probability(found.evidence)
     with clock("report"):
         poses = detections(found, choice, probability, part, scene)
         accepted = choice.kept & (probability >= config.accepted)

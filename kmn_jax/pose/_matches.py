@@ -111,10 +111,10 @@ def _find_matches(
     keypoint_logits = jnp.where(mask[:, None], keypoint_logits, 0)
 
     margins = segmentation_logits[:, OBJECT_CLASS] - segmentation_logits[:, 1 - OBJECT_CLASS]
-    is_object = mask & (margins > 0)
+    is_object = margins > 0
     if config.least_points:
         likest, _ = largest(jnp.where(mask, margins, -jnp.inf), min(config.least_points, n))
-        is_object = mask & ((margins > 0) | (margins >= likest.min()))
+        is_object = is_object | (margins >= likest.min())
     if config.softmax == "points":
         keypoint_logits = jax.nn.log_softmax(jnp.where(mask[:, None], keypoint_logits, -jnp.inf), axis=0)
         keypoint_logits = jnp.where(mask[:, None], keypoint_logits, 0)
@@ -123,7 +123,7 @@ def _find_matches(
         keypoint_scores = jax.nn.softmax(keypoint_logits, axis=1)
     # A ratio of softmax scores is a difference of logits.
     votes = keypoint_logits >= keypoint_logits.max(axis=1, keepdims=True) + log(config.vote_threshold)
-    votes = votes & is_object[:, None]
+    votes = votes & (mask & is_object)[:, None]
     scores = jax.nn.softmax(segmentation_logits, axis=1)[:, OBJECT_CLASS, None] * keypoint_scores
 
     size = min(config.capacity, n * k)
