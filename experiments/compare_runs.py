@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from experiments.evaluation.predictions import Export
 from experiments.evaluation.scores import THRESHOLD, cells_of, pooled
@@ -90,9 +90,13 @@ def _check_crops(folders: list[Export], objects: list[str], noises: tuple[float,
 def _interval(difference: Float[np.ndarray, " c"], scan: np.ndarray) -> tuple[float, float]:
     """Return the middle 95% of the mean difference over scans drawn again."""
     _, which = np.unique(scan, return_inverse=True)
-    counts, sums = np.bincount(which), np.bincount(which, difference)
+    return interval_over_scans(np.bincount(which, difference), np.bincount(which))
+
+
+def interval_over_scans(sums: Float[np.ndarray, " s"], counts: Int[np.ndarray, " s"]) -> tuple[float, float]:
+    """Return the middle 95% of a mean over scans drawn again, given the sum and the number of values in each scan."""
     rows = np.random.default_rng(0).integers(0, len(counts), (_DRAWS, len(counts)))
-    low, high = np.percentile(sums[rows].sum(axis=1) / counts[rows].sum(axis=1), [2.5, 97.5])
+    low, high = np.percentile(sums[rows].sum(axis=1) / np.maximum(counts[rows].sum(axis=1), 1), [2.5, 97.5])
     return float(low), float(high)
 
 

@@ -24,6 +24,7 @@ from experiments.reliability_picture import reliability_table, save_reliability
 from experiments.worst_images import WorstImages
 from kmn_jax.detection import (
     EVIDENCE,
+    DetectConfig,
     Detections,
     Probabilities,
     Scene,
@@ -110,7 +111,7 @@ def run(options: Options) -> dict[str, Any]:
     tallies: dict[str, WorldTally] = defaultdict(WorldTally)
     worst = WorstImages(CONFIG.accepted)
     for image in tqdm(world_images(options.folder, model, options.every), unit="image"):
-        scene, found = _found(model, fitted, image.part, image.scan)
+        scene, found = found_in(model, fitted, image.part, image.scan)
         counted = Tally.of(image, found)
         if options.worst is not None and scene is not None:
             worst.add(image, scene, found, counted)
@@ -118,7 +119,7 @@ def run(options: Options) -> dict[str, Any]:
         for name in groups:
             tallies[name].add(image, counted)
         if options.strangers and image.stranger is not None and len(image.truth):
-            _, found = _found(model, fitted, image.stranger, image.scan)
+            _, found = found_in(model, fitted, image.stranger, image.scan)
             for name in groups:
                 tallies[name].add_stranger(found)
     if not tallies:
@@ -140,13 +141,15 @@ def run(options: Options) -> dict[str, Any]:
     return results
 
 
-def _found(model: Model, fitted: Probabilities, part: Part, scan: Scan) -> tuple[Scene | None, Detections]:
+def found_in(
+    model: Model, fitted: Probabilities, part: Part, scan: Scan, config: DetectConfig = CONFIG
+) -> tuple[Scene | None, Detections]:
     """Return what is found in a whole scan; nothing where it is refused, as one that shows a plane alone."""
     try:
         scene = make_scene(scan, part.diameter)
     except InputError as error:
         return None, Detections(part.name, scan.unit, (), Timing({}, 0.0), str(error), ())
-    return scene, detect(model, fitted, part, scene, 0, CONFIG)
+    return scene, detect(model, fitted, part, scene, 0, config)
 
 
 if __name__ == "__main__":

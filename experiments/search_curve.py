@@ -1,0 +1,142 @@
+"""How many copies are found in how much time, by how thoroughly is searched: `python -m experiments.search_curve`.
+
+Each image of the world bins for validation is searched with all settings in turn, so that they are compared on the same
+images and in the same minutes; what is compiled on the way does not count. Settings differ from what users get in what
+their names say. Copies are counted as by `experiments.detect_worlds`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from experiments.bins import WorldImage, world_images
+from experiments.calibrate import SHIPPED
+from experiments.compare_runs import interval_over_scans
+from experiments.detect_bins import PRECISION, Tally
+from experiments.detect_worlds import found_in
+from experiments.evaluation.plots import as_png, new_figure
+from kmn_jax.detection import EVIDENCE, THOROUGH, DetectConfig, Probabilities, load_probabilities
+from kmn_jax.errors import InputError
+from kmn_jax.files import write_whole
+from kmn_jax.models import Model, load_pretrained
+from kmn_jax.report import check_target, print_table, write_json
+
+PLAIN = "as it is"
+
+
+def _with_crops(config: DetectConfig, **changes: Any) -> DetectConfig:
+    return replace(config, search=replace(config.search, crops=replace(config.search.crops, **changes)))
+
+
+_USUAL = DetectConfig()
+SETTINGS = {
+    "one draw": _with_crops(_USUAL, num_draws=1),
+    "two draws": _with_crops(_USUAL, num_draws=2),
+    "512 points a draw": _with_crops(_USUAL, num_points=512),
+    "one draw of 512 points": _with_crops(_USUAL, num_draws=1, num_points=512),
+    PLAIN: _USUAL,
+    "thorough": THOROUGH,
+    "thorough, 2,048 points a draw": _with_crops(THOROUGH, num_points=2048),
+    "thorough, eight draws": _with_crops(THOROUGH, num_draws=8),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to search."""
+
+    folder: Path = Path("outputs/worlds/validation")
+    calibration: Path = SHIPPED
+    settings: tuple[str, ...] = tuple(SETTINGS)
+    every: int = 5  # use every so many images
+    json: Path | None = None
+    picture: Path | None = None  # .png file
+
+
+def run(options: Options) -> list[dict[str, Any]]:
+    """Search, print and return a row for each setting."""
+    for target in (options.json, options.picture):
+        check_target(target)
+    unknown = [name for name in options.settings if name not in SETTINGS]
+    if unknown or PLAIN not in options.settings:
+        wrong = (
+            f"no settings are called {unknown[0]!r}"
+            if unknown
+            else f"{PLAIN!r}, which others are compared with, is missing"
+        )
+        raise InputError(f"{wrong}: choose among {', '.join(SETTINGS)}")
+    model = load_pretrained()
+    probabilities = load_probabilities(options.calibration, EVIDENCE)
+    tallies: dict[str, list[Tally]] = defaultdict(list)
+    for image in tqdm(world_images(options.folder, model, options.every), unit="image"):
+        for name in options.settings:
+            if not tallies[name]:
+                _searched(model, probabilities, image, name)  # compiles
+            tallies[name].append(_searched(model, probabilities, image, name))
+    if not tallies:
+        raise InputError(f"{options.folder} holds no images")
+    rows = [_row(name, tallies[name], tallies[PLAIN]) for name in options.settings]
+    print_table("Copies found, and time", rows)
+    write_json(options.json, {"settings": rows})
+    if options.picture is not None:
+        write_whole(options.picture, curve(rows))
+    return rows
+
+
+def _searched(model: Model, probabilities: Probabilities, image: WorldImage, name: str) -> Tally:
+    _, found = found_in(model, probabilities, image.part, image.scan, SETTINGS[name])
+    return Tally.of(image, found)
+
+
+def _row(name: str, tallies: Sequence[Tally], plain: Sequence[Tally]) -> dict[str, Any]:
+    """Return the numbers of a setting, beside the search as it is in the same images."""
+    together = Tally()
+    for tally in tallies:
+        together.extend(tally)
+    counted = together.row(name, name, _USUAL.accepted)
+    names = ("images", "copies", "recall", f"recall at precision {PRECISION}", "precision", "median s")
+    row = {"search": name} | {key: counted[key] for key in names}
+    row["90% s"] = float(np.percentile(together.seconds, 90))
+    took = np.array([[one.seconds[0], other.seconds[0]] for one, other in zip(tallies, plain, strict=True)])
+    took = took[(took > 0).all(axis=1)]
+    row["times as long"] = float(np.median(took[:, 0] / took[:, 1])) if len(took) else None
+    gained = np.array([_accepted(one) - _accepted(other) for one, other in zip(tallies, plain, strict=True)])
+    low, high = interval_over_scans(gained, np.array([tally.copies for tally in tallies]))
+    return row | {"recall more": f"{low:+.3f} to {high:+.3f}"}
+
+
+def _accepted(tally: Tally) -> int:
+    """Return how many copies that count have a right pose that is accepted."""
+    return sum(
+        hit and probability >= _USUAL.accepted for hit, probability in zip(tally.hit, tally.probability, strict=True)
+    )
+
+
+def curve(rows: Sequence[dict[str, Any]]) -> bytes:
+    """Return a picture of recall over time."""
+    figure, canvas = new_figure((6.5, 4))
+    axis = figure.add_subplot()
+    key = f"recall at precision {PRECISION}"
+    for row in rows:
+        axis.scatter(row["median s"], row[key], color="tab:blue" if row["search"] == PLAIN else "tab:grey")
+        axis.annotate(row["search"], (row["median s"], row[key]), (4, 4), textcoords="offset points", fontsize="small")
+    axis.set(xlabel="seconds for a scan (median)", ylabel=key)
+    axis.margins(x=0.25)
+    axis.grid(alpha=0.3)
+    return as_png(canvas)
+
+
+if __name__ == "__main__":
+    try:
+        run(tyro.cli(Options))
+    except InputError as problem:
+        sys.exit(f"error: {problem}")

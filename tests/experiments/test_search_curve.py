@@ -1,0 +1,59 @@
+"""Settings of the search beside each other: what they change, and how what they find is counted."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from experiments import search_curve
+from experiments.detect_bins import Tally
+from experiments.search_curve import PLAIN, SETTINGS, Options, run
+from kmn_jax.detection import DetectConfig
+from kmn_jax.errors import InputError
+
+
+def test_settings_differ_in_what_their_names_say() -> None:
+    assert SETTINGS[PLAIN] == DetectConfig()
+    assert len(set(SETTINGS.values())) == len(SETTINGS)
+    crops = SETTINGS["one draw of 512 points"].search.crops
+    assert (crops.num_draws, crops.num_points) == (1, 512)
+    crops = SETTINGS["thorough, eight draws"].search.crops
+    assert (crops.num_draws, SETTINGS["thorough, eight draws"].patience) == (8, None)
+
+
+def test_copies_and_times_stand_beside_those_of_the_search_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two copies in each of four images a setting finds one in half of the time, and one pose of its is doubtful."""
+    searched: list[str] = []
+
+    def fake(model: Any, probabilities: Any, image: Any, name: str) -> Tally:
+        searched.append(name)
+        if name == PLAIN:
+            return Tally([0.9, 0.9], [True, True], [True, True], 2, [2.0], [(0.0, 0.0, 0.0)] * 2)
+        return Tally([0.9, 0.5], [True, True], [True, True], 2, [1.0], [(0.0, 0.0, 0.0)] * 2)
+
+    monkeypatch.setattr(search_curve, "world_images", lambda *_: [object()] * 4)
+    monkeypatch.setattr(search_curve, "load_pretrained", lambda: None)
+    monkeypatch.setattr(search_curve, "_searched", fake)
+    options = Options(settings=("one draw", PLAIN), json=tmp_path / "curve.json", picture=tmp_path / "curve.png")
+    one, plain = run(options)
+    assert searched.count(PLAIN) == searched.count("one draw") == 5  # the first of each compiles, and is not counted
+    assert (one["recall"], plain["recall"]) == (0.5, 1.0)
+    assert (one["copies"], one["images"], one["median s"], one["times as long"]) == (8, 4, 1.0, 0.5)
+    assert (one["recall more"], plain["recall more"]) == ("-0.500 to -0.500", "+0.000 to +0.000")
+    assert json.loads((tmp_path / "curve.json").read_text())["settings"] == [one, plain]
+    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_bad_input_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match="no settings are called 'none': choose among one draw"):
+        run(Options(settings=("none", PLAIN)))
+    with pytest.raises(InputError, match="'as it is', which others are compared with, is missing"):
+        run(Options(settings=("one draw",)))
+    monkeypatch.setattr(search_curve, "world_images", lambda *_: [])
+    with pytest.raises(InputError, match="holds no images"):
+        run(Options(settings=(PLAIN,)))
