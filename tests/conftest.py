@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import os
 from collections.abc import Iterator
@@ -11,13 +12,14 @@ from tests.reference.compiled import kept_programs, quick_flags
 from tests.reference.order import place
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the workers have all cores: more threads wait for each other
 if os.environ["JAX_PLATFORMS"] == "cpu":
     os.environ["XLA_FLAGS"] = quick_flags()
 
 # Compiling is most of what tests take: what a run, a worker or a command of a test has compiled is read by the next.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = kept_programs()
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.02"
 
 import jax
 import pytest
@@ -27,6 +29,9 @@ install_import_hook("kmn_jax", "beartype.beartype")
 
 _MEMORY_MAPS = Path("/proc/self/maps")
 _MANY_MAPS = 15_000
+
+# Tracing makes a great many objects that stay: looking through all of them so often is a twentieth of the time.
+gc.set_threshold(200_000, 20, 50)
 
 # A product of float32 and an accidental float64 or int32 array, or a (n,) added to a (n, 3), is a bug here.
 jax.config.update("jax_numpy_dtype_promotion", "strict")

@@ -22,8 +22,6 @@ from kmn_jax.simulate import RayMesh, Surfels, render
 from tests.reference.meshes import Mesh, camera_scene, notched_box, pose, random_rotations, tube
 from tests.reference.parts import box_part
 
-pytestmark = pytest.mark.usefixtures("few_optimisations")
-
 CAMERA = Camera(500.0, 500.0, 159.5, 119.5, 320, 240)
 TRUE = pose((0.05, -0.02, 3.0), random_rotations(1, 5)[0])
 POLISHED = jax.jit(polished)

@@ -42,6 +42,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def images(folder: Path, model: Model) -> list[WorldImage]:
+    return list(world_images(folder, model))
+
+
 def test_a_quarter_of_the_images_lack_the_part(folder: Path) -> None:
     targets = json.loads((folder / TARGETS).read_text())
     assert len(targets) == 8
@@ -63,8 +68,7 @@ def test_parts_in_rows_touch_nothing_but_each_other(folder: Path) -> None:
     np.testing.assert_allclose(apart.min(axis=1), apart.min(), rtol=0.05)
 
 
-def test_images_come_with_their_scans(folder: Path, model: Model) -> None:
-    images = list(world_images(folder, model))
+def test_images_come_with_their_scans(folder: Path, model: Model, images: list[WorldImage]) -> None:
     assert [image.family for image in images] == ["mixed parts"] * 4 + ["touching rows"] * 4
     first = images[0]
     assert first.stranger is not None
@@ -77,8 +81,8 @@ def test_images_come_with_their_scans(folder: Path, model: Model) -> None:
         next(world_images(folder / "models", model))
 
 
-def test_counts(folder: Path, model: Model) -> None:
-    present, *_, absent = list(world_images(folder, model))[:4]
+def test_counts(images: list[WorldImage]) -> None:
+    present, *_, absent = images[:4]
     assert not len(absent.truth)
 
     def found(image: WorldImage, poses: list[np.ndarray], probability: float) -> Detections:
@@ -104,10 +108,9 @@ def test_counts(folder: Path, model: Model) -> None:
     assert row["turned, degrees, 90%"] == pytest.approx(0, abs=0.1)
 
 
-def test_the_worst_images_are_drawn(folder: Path, model: Model, tmp_path: Path) -> None:
-    images = list(world_images(folder, model))[:3]
+def test_the_worst_images_are_drawn(images: list[WorldImage], tmp_path: Path) -> None:
     worst, counts = WorstImages(accepted=0.5), [(1, 0.9, True), (3, 0.9, True), (1, 0.9, False)]
-    for image, (copies, probability, right) in zip(images, counts, strict=True):
+    for image, (copies, probability, right) in zip(images[:3], counts, strict=True):
         nothing = Detections(image.part.name, "mm", (), Timing({}, 0.0), "nothing was found")
         counted = Tally([probability], [right], [right], copies)
         worst.add(image, make_scene(image.scan, image.part.diameter), nothing, counted)

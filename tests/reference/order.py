@@ -5,31 +5,35 @@ from __future__ import annotations
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
-# The longest first; those that search bins with the same programs are apart, so that one compiles and the others read.
+# The longest first, and of them those that search bins: the first one alone, so that it compiles and the others read,
+# and before those that forget what was compiled as they compile in another way.
 LONGEST = (
     "detection/test_estimator.py",
     "train/test_loop.py",
     "experiments/test_evaluate.py",
-    "detection/test_crop_search.py",
+    "test_docs.py",
+    "test_docs_commands.py",
+    "test_cli_detect.py",
+    "experiments/test_versions.py",
+    "ros/test_results.py",
     "detection/test_bin_program.py",
     "train/test_sharding.py",
-    "train/test_checkpoint.py",
-    "test_cli_detect.py",
-    "experiments/test_build_data.py",
-    "experiments/test_versions.py",
-    "data/test_build.py",
-    "test_docs.py",
+    "detection/test_crop_search.py",
+    "models/test_keymatchnet.py",
+    "pose/test_ransac.py",
     "experiments/test_evaluate_network.py",
-    "test_docs_commands.py",
+    "train/test_checkpoint.py",
+    "experiments/test_build_data.py",
+    "data/test_build.py",
+    "experiments/test_worlds.py",
     "viz/test_viewer.py",
     "viz/test_viewer_panel.py",
     "train/test_examples.py",
+    "train/test_rendered.py",
+    "data/test_crops.py",
+    "pose/test_icp.py",
     "simulate/test_physics.py",
     "simulate/test_splat.py",
-    "ros/test_results.py",
-    "data/test_crops.py",
-    "models/test_keymatchnet.py",
-    "pose/test_ransac.py",
 )
 _PLACES = {TESTS / name: place for place, name in enumerate(LONGEST)}
 

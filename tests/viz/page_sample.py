@@ -70,7 +70,7 @@ def look_at(browser: Any, page: Viewer) -> None:
 
 
 def text(browser: Any) -> str:
-    return str(browser.find_element("tag name", "body").text)
+    return str(browser.execute_script("return document.body ? document.body.innerText : ''"))  # none while it loads
 
 
 def click(browser: Any, label: str) -> None:
