@@ -49,11 +49,26 @@ def test_copies_and_times_stand_beside_those_of_the_search_as_it_is(
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_what_was_searched_before_an_interruption_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    left = [*SETTINGS] * 3  # the first image twice, another one once
+
+    def fake(*given: Any) -> Tally:
+        if not left:
+            raise KeyboardInterrupt
+        left.pop()
+        return Tally([0.9], [True], [True], 1, [1.0], [(0.0, 0.0, 0.0)])
+
+    monkeypatch.setattr(search_curve, "world_images", lambda *_: [object()] * 9)
+    monkeypatch.setattr(search_curve, "load_pretrained", lambda: None)
+    monkeypatch.setattr(search_curve, "_searched", fake)
+    assert [row["images"] for row in run(Options())] == [2] * len(SETTINGS)
+
+
 def test_bad_input_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="no settings are called 'none': choose among one draw"):
         run(Options(settings=("none", PLAIN)))
     with pytest.raises(InputError, match="'as it is', which others are compared with, is missing"):
         run(Options(settings=("one draw",)))
     monkeypatch.setattr(search_curve, "world_images", lambda *_: [])
-    with pytest.raises(InputError, match="holds no images"):
+    with pytest.raises(InputError, match=r"no image of .* was searched"):
         run(Options(settings=(PLAIN,)))
