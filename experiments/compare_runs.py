@@ -94,7 +94,10 @@ def _interval(difference: Float[np.ndarray, " c"], scan: np.ndarray) -> tuple[fl
 
 
 def interval_over_scans(sums: Float[np.ndarray, " s"], counts: Int[np.ndarray, " s"]) -> tuple[float, float]:
-    """Return the middle 95% of a mean over scans drawn again, given the sum and the number of values in each scan."""
+    """Return the middle 95% of a mean over scans drawn again, given the sum and the number of values in each scan.
+
+    Scans may have none; so may, if they are few, all that are drawn, whose mean is then zero.
+    """
     rows = np.random.default_rng(0).integers(0, len(counts), (_DRAWS, len(counts)))
     low, high = np.percentile(sums[rows].sum(axis=1) / np.maximum(counts[rows].sum(axis=1), 1), [2.5, 97.5])
     return float(low), float(high)

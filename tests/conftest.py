@@ -30,7 +30,8 @@ install_import_hook("kmn_jax", "beartype.beartype")
 _MEMORY_MAPS = Path("/proc/self/maps")
 _MANY_MAPS = 15_000
 
-# Tracing makes a great many objects that stay: looking through all of them so often is a twentieth of the time.
+# Tracing makes a great many objects that stay: looking through all of them is a twentieth of the time. So that is left
+# to `_forget`.
 gc.set_threshold(200_000, 20, 50)
 
 # A product of float32 and an accidental float64 or int32 array, or a (n,) added to a (n, 3), is a bug here.
@@ -51,7 +52,7 @@ def forget_what_was_compiled() -> Iterator[None]:
     """Forget compiled programs before they take all the memory maps that Linux allows a process (65,530)."""
     yield
     if _MEMORY_MAPS.exists() and _MEMORY_MAPS.read_bytes().count(b"\n") > _MANY_MAPS:
-        jax.clear_caches()
+        _forget()
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def few_optimisations() -> Iterator[None]:
 
 @pytest.fixture
 def all_optimisations(few_optimisations: None) -> Iterator[None]:
-    """Compile as users do, in a file that else does not: without, one value may be rounded otherwise for each use."""
+    """Compile with what else is left out in this file: without, each use of a value may be rounded otherwise."""
     yield from _compiling_with(few=False)
 
 
@@ -71,7 +72,12 @@ def _compiling_with(few: bool) -> Iterator[None]:
     jax.config.update("jax_disable_most_optimizations", few)
     yield
     jax.config.update("jax_disable_most_optimizations", before)
-    jax.clear_caches()  # that are not asked how a program was compiled: other files would run the slow ones for minutes
+    _forget()  # caches are not asked how a program was compiled: other files would run the slow ones for minutes
+
+
+def _forget() -> None:
+    jax.clear_caches()
+    gc.collect()  # what programs are in may be in cycles
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -13,6 +13,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from tests.reference.compiled import quick_flags
 from tests.reference.order import LONGEST, TESTS, place
 
 ROOT = Path(__file__).parent.parent
@@ -94,3 +95,12 @@ def test_long_files_of_tests_begin_first() -> None:
     assert [place(TESTS / name) for name in LONGEST] == list(range(len(LONGEST)))
     assert all((TESTS / name).is_file() for name in LONGEST), "rename it in tests/reference/order.py, too"
     assert {place(path) for path in others} == {len(LONGEST)}
+
+
+def test_flags_of_xla_that_are_given_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=3 --xla_dump_to=folder")
+    flags = quick_flags().split()
+    assert flags[:2] == ["--xla_backend_optimization_level=3", "--xla_dump_to=folder"]
+    assert len({flag.partition("=")[0] for flag in flags}) == len(flags)
+    monkeypatch.setenv("XLA_FLAGS", quick_flags())
+    assert quick_flags().split() == flags

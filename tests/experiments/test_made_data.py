@@ -17,6 +17,7 @@ from experiments import (
     detect_worlds,
     evaluate,
     evaluate_network,
+    search_curve,
     train,
     tune_rivals,
 )
@@ -58,6 +59,7 @@ def test_the_command_that_makes_the_data_is_named(
         (lambda: detect_bins.run(detect_bins.Options()), "calibrate --method FPFH --output outputs/fpfh.calibration"),
         (lambda: detect_bins.run(detect_bins.Options(methods=("kmn_jax",))), "build_data test-sets"),
         (lambda: detect_worlds.run(detect_worlds.Options()), "build_data worlds"),
+        (lambda: search_curve.run(search_curve.Options()), "build_data worlds"),
         (lambda: compare_runs.compare(compare_runs.Options(Path("a"), Path("b"), TEST_SET)), "build_data test-sets"),
     ],
 )

@@ -3,25 +3,48 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from experiments import search_curve
+from experiments import detect_worlds, search_curve
 from experiments.detect_bins import Tally
 from experiments.search_curve import PLAIN, SETTINGS, Options, run
-from kmn_jax.detection import DetectConfig
+from kmn_jax.detection import THOROUGH, DetectConfig, Detections, Timing
 from kmn_jax.errors import InputError
 
 
 def test_settings_differ_in_what_their_names_say() -> None:
     assert SETTINGS[PLAIN] == DetectConfig()
-    assert len(set(SETTINGS.values())) == len(SETTINGS)
-    crops = SETTINGS["one draw of 512 points"].search.crops
-    assert (crops.num_draws, crops.num_points) == (1, 512)
-    crops = SETTINGS["thorough, eight draws"].search.crops
-    assert (crops.num_draws, SETTINGS["thorough, eight draws"].patience) == (8, None)
+    numbers = {"one": 1, "two": 2, "eight": 8}
+    for name, config in SETTINGS.items():
+        crops = config.search.crops
+        base = THOROUGH if "thorough" in name else DetectConfig()
+        draws = [number for word, number in numbers.items() if f"{word} draw" in name] or [base.search.crops.num_draws]
+        points = [int(number.replace(",", "")) for number in re.findall(r"([\d,]+) points", name)] or [None]
+        assert (crops.num_draws, crops.num_points) == (draws[0], points[0])
+        assert replace(config, search=base.search) == base
+
+
+def test_a_setting_is_what_is_searched_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[DetectConfig] = []
+
+    def fake(*given: Any) -> Detections:
+        asked.append(given[-1])
+        return Detections("part", "mm", (), Timing({"search": 1.0}, 0.0), "nothing was found")
+
+    monkeypatch.setattr(detect_worlds, "make_scene", lambda *_: object())
+    monkeypatch.setattr(detect_worlds, "detect", fake)
+    part, scan = SimpleNamespace(diameter=1.0, name="part"), SimpleNamespace(unit="mm")
+    image: Any = SimpleNamespace(part=part, scan=scan, visible=np.zeros(0), truth=np.zeros((0, 4, 4)))
+    for name in SETTINGS:
+        assert search_curve._searched(None, None, image, name).seconds == [1.0]  # type: ignore[arg-type]
+    assert asked == [*SETTINGS.values()]
 
 
 def test_copies_and_times_stand_beside_those_of_the_search_as_it_is(
@@ -44,7 +67,8 @@ def test_copies_and_times_stand_beside_those_of_the_search_as_it_is(
     assert searched.count(PLAIN) == searched.count("one draw") == 5  # the first of each compiles, and is not counted
     assert (one["recall"], plain["recall"]) == (0.5, 1.0)
     assert (one["copies"], one["images"], one["median s"], one["times as long"]) == (8, 4, 1.0, 0.5)
-    assert (one["recall more"], plain["recall more"]) == ("-0.500 to -0.500", "+0.000 to +0.000")
+    wide = [row["difference of recall, 95%"] for row in (one, plain)]
+    assert wide == ["-0.500 to -0.500", "+0.000 to +0.000"]
     assert json.loads((tmp_path / "curve.json").read_text())["settings"] == [one, plain]
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
 

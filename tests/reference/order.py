@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
-# The longest first, and of them those that search bins: the first one alone, so that it compiles and the others read,
-# and before those that forget what was compiled as they compile in another way.
+# The longest first, and of them those that search bins, before those that forget what was compiled as they compile in
+# another way. Training comes second, so that with two workers one compiles the search and the other reads it.
 LONGEST = (
     "detection/test_estimator.py",
     "train/test_loop.py",

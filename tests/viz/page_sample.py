@@ -70,7 +70,8 @@ def look_at(browser: Any, page: Viewer) -> None:
 
 
 def text(browser: Any) -> str:
-    return str(browser.execute_script("return document.body ? document.body.innerText : ''"))  # none while it loads
+    found = browser.find_elements("tag name", "body")  # none while it loads
+    return str(found[0].text) if found else ""
 
 
 def click(browser: Any, label: str) -> None:
