@@ -17,6 +17,7 @@ from experiments.detect_bins import Tally
 from experiments.search_curve import PLAIN, SETTINGS, Options, run
 from kmn_jax.detection import THOROUGH, DetectConfig, Detections, Timing
 from kmn_jax.errors import InputError
+from kmn_jax.pose import RIGHT, THRESHOLDS
 
 
 def test_settings_differ_in_what_their_names_say() -> None:
@@ -47,6 +48,13 @@ def test_a_setting_is_what_is_searched_with(monkeypatch: pytest.MonkeyPatch) -> 
     assert asked == [*SETTINGS.values()]
 
 
+def right_poses(probability: list[float], seconds: float) -> Tally:
+    """Return what is counted of an image all of whose copies have a right pose."""
+    count = len(probability)
+    right, states = [True] * count, [(RIGHT,) * len(THRESHOLDS)] * count
+    return Tally(probability, right, right, count, [seconds], [(0.0, 0.0, 0.0)] * count, states)
+
+
 def test_copies_and_times_stand_beside_those_of_the_search_as_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -56,8 +64,8 @@ def test_copies_and_times_stand_beside_those_of_the_search_as_it_is(
     def fake(model: Any, probabilities: Any, image: Any, name: str) -> Tally:
         searched.append(name)
         if name == PLAIN:
-            return Tally([0.9, 0.9], [True, True], [True, True], 2, [2.0], [(0.0, 0.0, 0.0)] * 2)
-        return Tally([0.9, 0.5], [True, True], [True, True], 2, [1.0], [(0.0, 0.0, 0.0)] * 2)
+            return right_poses([0.9, 0.9], seconds=2.0)
+        return right_poses([0.9, 0.5], seconds=1.0)
 
     monkeypatch.setattr(search_curve, "world_images", lambda *_: [object()] * 4)
     monkeypatch.setattr(search_curve, "load_pretrained", lambda: None)
@@ -80,7 +88,7 @@ def test_what_was_searched_before_an_interruption_counts(monkeypatch: pytest.Mon
         if not left:
             raise KeyboardInterrupt
         left.pop()
-        return Tally([0.9], [True], [True], 1, [1.0], [(0.0, 0.0, 0.0)])
+        return right_poses([0.9], seconds=1.0)
 
     monkeypatch.setattr(search_curve, "world_images", lambda *_: [object()] * 9)
     monkeypatch.setattr(search_curve, "load_pretrained", lambda: None)
