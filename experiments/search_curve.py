@@ -138,11 +138,10 @@ def curve(rows: Sequence[dict[str, Any]]) -> bytes:
     axis = figure.add_subplot()
     for row in (row for row in rows if row["median s"] is not None):
         place = (row["median s"], row["recall"])
-        axis.scatter(*place, color="tab:blue" if row["search"] == PLAIN else "tab:grey")
-        axis.annotate(row["search"], place, (4, 4), textcoords="offset points", fontsize="small")
+        axis.scatter(*place, marker="*" if row["search"] == PLAIN else "o", label=row["search"])
     axis.set(xlabel="seconds of searching (median)", ylabel=f"recall from {_USUAL.accepted} on")
-    axis.margins(x=0.25)
     axis.grid(alpha=0.3)
+    figure.legend(loc="outside right upper", fontsize="small")
     return as_png(canvas)
 
 
