@@ -128,6 +128,10 @@ class Tally:
         states = [(WRONG,) * len(THRESHOLDS)] * count
         return cls(probability, wrong, list(wrong), offsets=[_NOWHERE] * count, states=states)
 
+    def num_found(self, accepted: float) -> int:
+        """Return how many copies that count have a right pose of such a probability or a higher one."""
+        return int((np.array(self.hit, dtype=bool) & (np.array(self.probability) >= accepted)).sum())
+
     def recall_at(self, precision: float) -> float:
         """Return the recall of poses down to the probability from which on such a share of them is right."""
         right, hit = np.array(self.right, dtype=bool), np.array(self.hit, dtype=bool)
@@ -139,13 +143,13 @@ class Tally:
     def row(self, name: str, method: str, accepted: float) -> dict[str, Any]:
         """Return the numbers."""
         probability, right = np.array(self.probability), np.array(self.right, dtype=bool)
-        chosen, hit = probability >= accepted, np.array(self.hit, dtype=bool)
+        chosen = probability >= accepted
         return {
             "bins": name,
             "method": method,
             "images": len(self.seconds),
             "copies": self.copies,
-            "recall": float(hit[chosen].sum()) / max(self.copies, 1),
+            "recall": self.num_found(accepted) / max(self.copies, 1),
             f"recall at precision {PRECISION}": self.recall_at(PRECISION),
             "accepted": int(chosen.sum()),
             "precision": float(right[chosen].mean()) if chosen.any() else None,

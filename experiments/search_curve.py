@@ -113,8 +113,8 @@ def _row(name: str, searched: Sequence[dict[str, Tally]]) -> dict[str, Any]:
     counted = together.row(name, name, _USUAL.accepted)
     names = ("images", "copies", "recall", f"recall at precision {PRECISION}", "precision")
     row = {"search": name} | {key: counted[key] for key in names}
-    gained = np.array([_accepted(image[name]) - _accepted(image[PLAIN]) for image in searched], dtype=float)
-    low, high = interval_over_scans(gained, np.array([image[name].copies for image in searched]))
+    found, plain = (np.array([image[one].num_found(_USUAL.accepted) for image in searched]) for one in (name, PLAIN))
+    low, high = interval_over_scans((found - plain).astype(float), np.array([image[name].copies for image in searched]))
     row["difference of recall, 95%"] = f"{low:+.3f} to {high:+.3f}"
     took = np.array([[image[name].seconds[0], image[PLAIN].seconds[0]] for image in searched])
     took = took[(took > 0).all(axis=1)]  # scans that are refused take none
@@ -123,13 +123,6 @@ def _row(name: str, searched: Sequence[dict[str, Tally]]) -> dict[str, Any]:
     times = {"median s": np.median(took[:, 0]), "90% s": np.percentile(took[:, 0], 90)}
     times["times as long"] = np.median(took[:, 0] / took[:, 1])
     return row | {key: float(value) for key, value in times.items()}
-
-
-def _accepted(tally: Tally) -> int:
-    """Return how many copies that count have a right pose that is accepted."""
-    return sum(
-        hit and probability >= _USUAL.accepted for hit, probability in zip(tally.hit, tally.probability, strict=True)
-    )
 
 
 def curve(rows: Sequence[dict[str, Any]]) -> bytes:

@@ -35,7 +35,7 @@ class WorstImages:
         """Look at an image; one without faults is never among the worst."""
         chosen = np.array(counted.probability) >= self.accepted
         wrong = int((chosen & ~np.array(counted.right, dtype=bool)).sum())
-        missed = counted.copies - int((chosen & np.array(counted.hit, dtype=bool)).sum())
+        missed = counted.copies - counted.num_found(self.accepted)
         if wrong + missed:
             family = self._kept.setdefault(image.family, [])
             family.append(_Image(missed, wrong, image, scene, found))
