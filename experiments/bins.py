@@ -84,6 +84,23 @@ class WorldImage(TrueImage):
     kind: int  # that parts of one family share
     scan: Scan
 
+    def cloud(self, margin: float | None = None) -> Scan:
+        """Return the scan as a cloud; with a margin, in diameters, what is so near to the surface of a copy alone."""
+        from scipy.spatial import cKDTree
+
+        points = self.scan.points
+        if margin is not None:
+            near = margin * self.part.diameter
+            surface = cKDTree(self.part.points)
+            kept = np.zeros(len(points), dtype=bool)
+            for pose in self.truth:
+                local = (points - pose[:3, 3]) @ pose[:3, :3]
+                inside = (local >= self.part.minimum - near) & (local <= self.part.maximum + near)
+                rows = np.flatnonzero(inside.all(axis=1))
+                kept[rows] |= np.isfinite(surface.query(local[rows], distance_upper_bound=near)[0])
+            points = points[kept]
+        return Scan(points, None, None, None, self.scan.unit)
+
 
 @jax.jit
 def adi_of_pairs(pairs: jax.Array, points: jax.Array) -> jax.Array:

@@ -2,14 +2,15 @@
 
 Poses are searched in the validation bins (`python -m experiments.build_data validation-bins`), whose objects the
 network was not trained with, and with `--worlds` and `--known-worlds` in the whole scans of world bins; in every second
-image also a part that is not there. A small model of the evidence is fitted to whether they are right. Each object's
-probabilities are also predicted by a model that was fitted without it, which gives the reliability that is printed. The
-model of poses as they are found is fitted first: it chooses which of them are refined, here as in detection. Of refined
-poses detection reports one for each place: the one that a third model holds for the most probable, which is fitted to
-whether all points are in their places (MSSD), and not their mean (ADI). Models are too sure of themselves about kinds
-of objects that they were not fitted to: so the scales of the refined poses' models are fitted to what detection would
-report by models that do not know the kind. From the same poses, of scans of which is known where parts are, a fourth
-model learns what poses of one scene say about each other.
+image also a part that is not there. Of the known worlds two thirds of the scans are given as clouds, half of these cut
+out around the copies, as scans often come. A small model of the evidence is fitted to whether they are right. Each
+object's probabilities are also predicted by a model that was fitted without it, which gives the reliability that is
+printed. The model of poses as they are found is fitted first: it chooses which of them are refined, here as in
+detection. Of refined poses detection reports one for each place: the one that a third model holds for the most
+probable, which is fitted to whether all points are in their places (MSSD), and not their mean (ADI). Models are too
+sure of themselves about kinds of objects that they were not fitted to: so the scales of the refined poses' models are
+fitted to what detection would report by models that do not know the kind. From the same poses, of scans of which is
+known where parts are, a fourth model learns what poses of one scene say about each other.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ import tyro
 from jaxtyping import Bool, Float, Int
 from tqdm import tqdm
 
-from experiments.bins import THRESHOLD, TrueImage, bin_images, world_images
+from experiments.bins import THRESHOLD, TrueImage, WorldImage, bin_images, world_images
 from experiments.fpfh import fpfh_poses
 from experiments.reliability_picture import reliability_table, save_reliability
 from experiments.test_sets import SPLIT
@@ -56,6 +57,7 @@ from kmn_jax.detection import (
 )
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
+from kmn_jax.io import Scan
 from kmn_jax.models import Model, load_model, load_pretrained
 from kmn_jax.objects import Part, model_digest
 from kmn_jax.report import check_target, print_table, write_json
@@ -63,6 +65,7 @@ from kmn_jax.report import check_target, print_table, write_json
 _LOOSE = DetectConfig(reported=0.03)  # refines more than detection does, so that the fit sees what is just refused
 _SCALE_RIDGE = 1e-4  # hardly any: it makes probabilities too modest
 _COLUMNS = ("evidence", "error", "largest_error", "object", "search", "narrowed", "refined", "reported")  # of poses
+_MARGINS = (0.02, 0.3)  # diameters: so much of what is around copies is left in scans that are cut out
 _KINDS = 100  # more than the families of parts in a folder of world bins
 SHIPPED = Path(__file__).parent.parent / "kmn_jax" / "pretrained" / "small.calibration.json"
 
@@ -99,7 +102,7 @@ class Search(NamedTuple):
 
     def columns(self, found: Candidates) -> dict[str, np.ndarray]:
         """Return evidence, errors and object of poses; those of a part that is not there have no finite errors."""
-        poses = found.T_camera_object[found.usable]
+        poses = self.scene.T_scene_camera @ found.T_camera_object[found.usable]
         errors = [
             errors.min(axis=1, initial=np.inf)
             for errors in (self.image.errors(poses), self.image.largest_errors(poses))
@@ -183,10 +186,21 @@ def _images(options: Options, model: Model) -> Iterator[tuple[int, TrueImage, Sc
     for number, world in enumerate((options.worlds, options.known_worlds)):
         if world is None:
             continue
-        for found in tqdm(world_images(world, model), unit="image", desc=f"worlds {world.name}"):
+        is_known = number == 1
+        for row, found in enumerate(tqdm(world_images(world, model), unit="image", desc=f"worlds {world.name}")):
             with suppress(InputError):  # a scan without foreground, as of an empty table
-                scene = make_scene(found.scan, found.part.diameter)
-                yield _KINDS * number + found.kind, found, scene, number == 1
+                scene = make_scene(as_given(found, row) if is_known else found.scan, found.part.diameter)
+                yield _KINDS * number + found.kind, found, scene, is_known
+
+
+def as_given(image: WorldImage, row: int) -> Scan:
+    """Return a scan as users may have it: as a depth image, as a cloud, or, if there are any, cut out around copies."""
+    if row % 3 == 0:
+        return image.scan
+    cut = None
+    if row % 3 == 2:
+        cut = image.cloud(np.random.default_rng(row).uniform(*_MARGINS))
+    return cut if cut is not None and len(cut.points) else image.cloud()
 
 
 def _proposed(search: Search, model: Model, config: SearchConfig, method: str) -> Candidates:

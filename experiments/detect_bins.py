@@ -35,6 +35,7 @@ from kmn_jax.detection import (
     DetectConfig,
     Detections,
     Probabilities,
+    chance_calibration_error,
     chosen,
     detect,
     detections,
@@ -154,6 +155,7 @@ class Tally:
             "accepted": int(chosen.sum()),
             "precision": float(right[chosen].mean()) if chosen.any() else None,
             "calibration error": expected_calibration_error(probability, right),
+            "calibration error by chance": chance_calibration_error(probability),
             "median s": float(np.median(self.seconds)),
             **self._accuracy(probability, chosen, right),
         }

@@ -11,7 +11,7 @@ import sys
 from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -41,6 +41,7 @@ from kmn_jax.report import check_target, print_table, write_json
 
 _CERTAIN = 0.9
 _LESS_PRECISE = 0.9
+_MARGIN = 0.2  # diameters, of cut-outs
 _ALL = "all"
 _BUT = ("time of flight", "touching rows")  # families with more than a millimetre of noise, and of one field of parts
 _OTHERS = f"all but {' and '.join(_BUT)}"
@@ -54,6 +55,7 @@ class Options:
     model: Path | None = None  # .safetensors; the released model unless given
     calibration: Path = SHIPPED
     every: int = 1  # use every so many images
+    given: Literal["images", "clouds", "cut-outs"] = "images"  # cut-outs: clouds of what is near to copies alone
     strangers: bool = False  # also search all images for a part that is not there
     json: Path | None = None
     picture: Path | None = None  # .png file for the reliability diagrams
@@ -102,6 +104,14 @@ class WorldTally:
         }
 
 
+def scan_of(image: WorldImage, given: Literal["images", "clouds", "cut-outs"]) -> Scan | None:
+    """Return the scan of an image in a form, none if it has no point on a copy."""
+    if given == "images":
+        return image.scan
+    scan = image.cloud(_MARGIN if given == "cut-outs" else None)
+    return scan if len(scan.points) else None
+
+
 def run(options: Options) -> dict[str, Any]:
     """Detect, print and return the numbers."""
     for target in (options.json, options.picture, options.worst and options.worst / "worst.png"):
@@ -111,7 +121,10 @@ def run(options: Options) -> dict[str, Any]:
     tallies: dict[str, WorldTally] = defaultdict(WorldTally)
     worst = WorstImages(CONFIG.accepted)
     for image in tqdm(world_images(options.folder, model, options.every), unit="image"):
-        scene, found = found_in(model, fitted, image.part, image.scan)
+        scan = scan_of(image, options.given)
+        if scan is None:
+            continue
+        scene, found = found_in(model, fitted, image.part, scan)
         counted = Tally.of(image, found)
         if options.worst is not None and scene is not None:
             worst.add(image, scene, found, counted)
@@ -119,7 +132,7 @@ def run(options: Options) -> dict[str, Any]:
         for name in groups:
             tallies[name].add(image, counted)
         if options.strangers and image.stranger is not None and len(image.truth):
-            _, found = found_in(model, fitted, image.stranger, image.scan)
+            _, found = found_in(model, fitted, image.stranger, scan)
             for name in groups:
                 tallies[name].add_stranger(found)
     if not tallies:

@@ -26,7 +26,7 @@ from experiments.compare_runs import interval_over_scans
 from experiments.detect_bins import PRECISION, Tally
 from experiments.detect_worlds import found_in
 from experiments.evaluation.plots import as_png, new_figure
-from kmn_jax.detection import EVIDENCE, THOROUGH, DetectConfig, Probabilities, load_probabilities
+from kmn_jax.detection import EVIDENCE, FAST, THOROUGH, DetectConfig, Probabilities, load_probabilities
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
 from kmn_jax.models import Model, load_pretrained
@@ -41,10 +41,12 @@ def _with_crops(config: DetectConfig, **changes: Any) -> DetectConfig:
 
 _USUAL = DetectConfig()
 SETTINGS = {
+    "fast": FAST,
+    "fast, patience 4": replace(FAST, patience=4),
+    "fast, all finely": replace(FAST, patience=None),
     "one draw": _with_crops(_USUAL, num_draws=1),
     "two draws": _with_crops(_USUAL, num_draws=2),
     "512 points a draw": _with_crops(_USUAL, num_points=512),
-    "one draw of 512 points": _with_crops(_USUAL, num_draws=1, num_points=512),
     PLAIN: _USUAL,
     "thorough": THOROUGH,
     "thorough, 2,048 points a draw": _with_crops(THOROUGH, num_points=2048),

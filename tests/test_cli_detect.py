@@ -14,7 +14,8 @@ import trimesh
 
 from kmn_jax.bop import bop_scan
 from kmn_jax.cli import main
-from kmn_jax.detection import Detections, PoseEstimator, Timing
+from kmn_jax.detection import FAST, THOROUGH, DetectConfig, Detections, PoseEstimator, Timing, config_of
+from kmn_jax.errors import InputError
 from kmn_jax.objects import Part
 from kmn_jax.serve import ServeConfig
 from tests.serve.serve_sample import running
@@ -120,6 +121,26 @@ def test_a_server_gives_what_a_search_here_gives(card: Path, tmp_path: Path) -> 
 def table(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
+
+
+def test_the_effort_that_is_asked_for_is_made(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[DetectConfig | None] = []
+
+    def load(weights: str, config: DetectConfig | None = None) -> PoseEstimator:
+        asked.append(config)
+        raise InputError("that is enough")
+
+    monkeypatch.setattr(PoseEstimator, "from_pretrained", load)
+    given = ["detect", "--object", str(MOTOR), "--scene", str(IMAGE)]
+    for more in (["--effort", "fast"], [], ["--effort", "usual"], ["--effort", "thorough"]):
+        assert main([*given, *more]) == 2
+    assert asked == [FAST, DetectConfig(), DetectConfig(), THOROUGH]
+    assert main([*given, "--effort", "more"]) == 2
+    assert "effort" in capsys.readouterr().err
+    with pytest.raises(InputError, match="choose among fast, usual, thorough"):
+        config_of("more")
 
 
 def test_a_cloud_around_a_point(card: Path, cloud: Path, tmp_path: Path) -> None:

@@ -171,6 +171,19 @@ def expected_calibration_error(
     return float(sum(count * abs(mean - share) for mean, share, count in rows) / max(len(right), 1))
 
 
+def chance_calibration_error(probability: Float[np.ndarray, " s"], bins: int = 10, draws: int = 200) -> float:
+    """Return the mean `expected_calibration_error` of independent poses that are right just as often as is said.
+
+    `probability` is what is said of each, `bins` the number of ranges of it, `draws` that of random outcomes which the
+    mean is over. An error about as large as this says nothing against the probabilities.
+    """
+    rng = np.random.default_rng(0)
+    errors = [
+        expected_calibration_error(probability, rng.random(len(probability)) < probability, bins) for _ in range(draws)
+    ]
+    return float(np.mean(errors))
+
+
 def reliability(
     probability: Float[np.ndarray, " s"], right: Bool[np.ndarray, " s"], bins: int = 10
 ) -> list[tuple[float, float, int]]:

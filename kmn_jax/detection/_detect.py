@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from kmn_jax.detection._calibration import Calibration, Probabilities
 from kmn_jax.detection._canonical import canonical_pose
 from kmn_jax.detection._coverage import cover, nothing_covered, to_search, unexplained
-from kmn_jax.detection._crop_search import CropPoses
+from kmn_jax.detection._crop_search import CropPoses, CropSearchConfig
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place
 from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
 from kmn_jax.detection._frames import placed
@@ -88,7 +88,20 @@ class DetectConfig:
         return replace(self.search, crops=replace(crops, give_up=crops.give_up or (self.give_up and not at_places)))
 
 
+FAST = DetectConfig(search=SearchConfig(crops=CropSearchConfig(num_draws=1, num_points=512)))  # measured with `small`
 THOROUGH = DetectConfig(patience=None, give_up=False)
+Effort = Literal["fast", "usual", "thorough"]
+
+
+def config_of(effort: str) -> DetectConfig:
+    """Return how is searched with an effort: "fast", "usual" or "thorough".
+
+    docs/detect.md says what they gain and cost. Raises InputError if there is no such effort.
+    """
+    known = {"fast": FAST, "usual": DetectConfig(), "thorough": THOROUGH}
+    if effort not in known:
+        raise InputError(f"effort = {effort!r} is not known: choose among {', '.join(known)}")
+    return known[effort]
 
 
 def detect(

@@ -69,6 +69,8 @@ class PictureAgreement(NamedTuple):
     free_level: Scalar  # of the outline that nothing in front hides: the measured surface goes on
     buried: Scalar  # of the whole surface: below the plane of what surrounds it; by less than 2% it counts in part
     raised: Scalar  # mean height of that surface above the plane, seen from the camera, at most half a diameter
+    surrounded: Scalar  # of the whole surface: inside of what is measured around it, see `_surroundings`
+    buried_between: Scalar  # buried, where each point of the surface counts as much as it is surrounded
 
 
 class _Predicted(NamedTuple):
@@ -214,7 +216,12 @@ def _slope(
 def _surroundings(
     seen: _Predicted, found: _Measured, around: Bool[Array, "s s"], diameter: Scalar
 ) -> dict[str, Scalar]:
-    """Return how an object's whole surface lies to the plane of what is measured around it; in it if nothing is."""
+    """Return how an object's whole surface lies to the plane of what is measured around it; in it if nothing is.
+
+    Where cells all lie to one side, the plane beyond them is anybody's guess. So each point is surrounded in full up to
+    one standard deviation of the cells from their middle, and farther away, at d of these, by 1 / d^2: by a half on a
+    ring of cells.
+    """
     weight = around.astype(jnp.float32).reshape(-1)
     total = jnp.maximum(weight.sum(), 1)
 
@@ -227,14 +234,20 @@ def _surroundings(
     x, y, rise = (u - middle_u) / seen.pitch, (v - middle_v) / seen.pitch, closeness - level
     xx, xy, yy = mean(x * x) + _UNTILTED, mean(x * y), mean(y * y) + _UNTILTED
     along_x, along_y = mean(x * rise), mean(y * rise)
-    tilt_x, tilt_y = yy * along_x - xy * along_y, xx * along_y - xy * along_x
+    spread = xx * yy - xy**2
+    tilt_x, tilt_y = (yy * along_x - xy * along_y) / spread, (xx * along_y - xy * along_x) / spread
     z = jnp.maximum(seen.surface[:, 2], 1e-6 * diameter)
     x, y = (seen.surface[:, 0] / z - middle_u) / seen.pitch, (seen.surface[:, 1] / z - middle_v) / seen.pitch
-    plane = seen.nearest / jnp.maximum(level + (tilt_x * x + tilt_y * y) / (xx * yy - xy**2), _FLATTEST)
+    plane = seen.nearest / jnp.maximum(level + tilt_x * x + tilt_y * y, _FLATTEST)
     height = jnp.where(around.any(), (plane - z) / diameter, 0)
+    below = jnp.clip(-height / _BELOW, 0, 1)
+    off = jnp.maximum((yy * x * x - 2 * xy * x * y + xx * y * y) / spread, 1)
+    between = jnp.where(around.any(), 1 / off, 0)
     return {
-        "buried": jnp.clip(-height / _BELOW, 0, 1).mean(),
+        "buried": below.mean(),
         "raised": jnp.clip(height, -_RAISED, _RAISED).mean(),
+        "surrounded": between.mean(),
+        "buried_between": (between * below).mean(),
     }
 
 

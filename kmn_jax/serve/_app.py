@@ -15,6 +15,7 @@ from starlette import datastructures
 from starlette.exceptions import HTTPException
 
 from kmn_jax import __version__
+from kmn_jax.detection import Effort
 from kmn_jax.errors import InputError
 from kmn_jax.objects import Part
 from kmn_jax.serve._gate import Gate
@@ -173,7 +174,7 @@ async def detect(
     random_seed: Annotated[int, Form()] = 0,
     roi: Annotated[str | None, Form(description="6 or 9 numbers with commas between them")] = None,
     plane: Annotated[Literal["auto", "always", "never"], Form()] = "auto",
-    thorough: Annotated[bool, Form()] = False,
+    effort: Annotated[Effort, Form()] = "usual",
     sensor: Annotated[str | None, Form(description="X,Y,Z of the sensor in the scan's frame")] = None,
     top: Annotated[int | None, Form(description="return the first poses only")] = None,
     picture: Annotated[bool, Form(description="draw one; the header Picture says where it is")] = False,
@@ -193,7 +194,7 @@ async def detect(
         random_seed,
         roi,
         plane,
-        thorough,
+        effort,
         sensor,
         top,
         picture,

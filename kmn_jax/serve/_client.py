@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from kmn_jax.bop import bop_object, bop_scan, bop_scene_id, is_bop_image
-from kmn_jax.detection import CropPrediction, Detection, Detections, Timing
+from kmn_jax.detection import CropPrediction, Detection, Detections, Effort, Timing
 from kmn_jax.errors import InputError
 from kmn_jax.io import read_file, resolve_unit
 from kmn_jax.limits import parse_json
@@ -49,7 +49,7 @@ def detect_on_server(
     random_seed: int = 0,
     roi: str | None = None,
     plane: Literal["auto", "always", "never"] = "auto",
-    thorough: bool = False,
+    effort: Effort = "usual",
     sensor: str | None = None,
     top: int | None = None,
     picture: bool = False,
@@ -68,7 +68,7 @@ def detect_on_server(
         "random_seed": random_seed,
         "roi": roi,
         "plane": plane,
-        "thorough": thorough,
+        "effort": effort,
         "sensor": sensor,
         "top": top,
         "picture": picture,

@@ -15,14 +15,15 @@ from typing import Any, BinaryIO, Literal
 import numpy as np
 
 from kmn_jax.detection import (
-    THOROUGH,
     Clock,
     Detections,
+    Effort,
     ForegroundOptions,
     OrientedBox,
     PoseEstimator,
     Scene,
     as_json,
+    config_of,
 )
 from kmn_jax.errors import InputError, number_list
 from kmn_jax.objects import Part
@@ -67,7 +68,7 @@ class Question:
     random_seed: int = 0
     roi: str | None = None
     plane: Literal["auto", "always", "never"] = "auto"
-    thorough: bool = False
+    effort: Effort = "usual"
     sensor: str | None = None
     top: int | None = None
     picture: bool = False
@@ -104,7 +105,9 @@ class Searches:
         clock = Clock()
         with clock("scene"):
             scene, places = self._scene(part, asked)
-        estimator = replace(self.estimator, config=THOROUGH) if asked.thorough else self.estimator
+        estimator = self.estimator
+        if asked.effort != "usual":
+            estimator = replace(estimator, config=config_of(asked.effort))
         found = estimator.detect(part, scene, at=places, random_seed=asked.random_seed, top=asked.top, clock=clock)
         facts = {"seed": asked.random_seed, "weights": self.weights, "model": part.model_digest}
         result = as_json(found, object_name, asked.scene.name, facts)

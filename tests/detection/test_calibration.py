@@ -16,6 +16,7 @@ from kmn_jax.detection import (
     Calibration,
     CalibrationArrays,
     Probabilities,
+    chance_calibration_error,
     device_calibration,
     expected_calibration_error,
     fit_calibration,
@@ -43,6 +44,15 @@ def test_a_known_model_is_found_and_its_probabilities_hold() -> None:
     np.testing.assert_allclose(fitted.bias + fitted.weights[2], 1, atol=0.15)
     assert expected_calibration_error(fitted.probability(evidence), right) < 0.02
     assert expected_calibration_error(np.full(len(right), 0.99), right) > 0.2
+
+
+def test_few_poses_have_a_calibration_error_by_chance_alone() -> None:
+    # Of 100 tosses of a coin, the share of heads is off by 0.0398 in the mean.
+    np.testing.assert_allclose(chance_calibration_error(np.full(100, 0.5), draws=2000), 0.0398, rtol=0.05)
+    probability = np.linspace(0.05, 0.95, 10)
+    few, many = (chance_calibration_error(np.repeat(probability, count)) for count in (5, 500))
+    np.testing.assert_allclose(few / many, 10, rtol=0.1)
+    assert chance_calibration_error(np.zeros(0)) == 0 == chance_calibration_error(np.ones(20))
 
 
 def test_a_weight_counts_a_pose_several_times() -> None:

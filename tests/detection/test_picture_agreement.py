@@ -66,6 +66,9 @@ def test_a_box_on_a_floor_is_above_it_and_one_in_it_is_buried(depth: jax.Array, 
     above, below = of(lying, floor), of(flush, floor)
     assert above.buried < 0.01
     assert below.buried > 0.6  # all but the front and the upper edges of the sides
+    assert above.surrounded > 0.8
+    assert above.buried_between < 0.01
+    assert 0.2 < below.buried_between < below.surrounded  # what is in front of the box hides it, and is not around it
     height = SIZES[2] / 2 / down[2] / PART.diameter  # of the middle, along the line of sight
     np.testing.assert_allclose([above.raised, below.raised], [height, -height], atol=0.02)
 
@@ -74,6 +77,20 @@ def test_without_surroundings_nothing_is_buried(depth: jax.Array) -> None:
     for nothing in (jnp.zeros_like(depth), jnp.full_like(depth, 1.0)):  # not measured, or hidden
         found = of(POSES[0], nothing)
         assert (found.buried, found.raised) == (0, 0)
+        assert (found.surrounded, found.buried_between) == (0, 0)
+
+
+def test_beside_a_slope_that_is_all_there_is_hardly_anything_is_known_to_be_buried(depth: jax.Array) -> None:
+    # A slope that is measured to the right of the box alone, and would rise above all of it.
+    _, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
+    T = pose((0.0, 0.0, WALL))
+    edge = SIZES[0] / 2 / (WALL - SIZES[2] / 2)
+    x = (columns - CAMERA.cx) / CAMERA.fx
+    slope = np.where(x > edge, WALL / (1 + 2 * (edge - x)), 0)
+    found = of(T, jnp.asarray(slope, dtype=jnp.float32))
+    whole = of(T, jnp.asarray(np.where(x > edge, slope, WALL - SIZES[2] / 2), dtype=jnp.float32))
+    assert found.surrounded < 0.2 < 0.6 < whole.surrounded
+    assert found.buried_between <= found.surrounded < found.buried
 
 
 def test_a_pose_half_on_a_box_is_open_there_only(depth: jax.Array) -> None:

@@ -15,7 +15,7 @@ import pytest
 from experiments import detect_worlds, search_curve
 from experiments.detect_bins import Tally
 from experiments.search_curve import PLAIN, SETTINGS, Options, run
-from kmn_jax.detection import THOROUGH, DetectConfig, Detections, Timing
+from kmn_jax.detection import FAST, THOROUGH, DetectConfig, Detections, Timing
 from kmn_jax.errors import InputError
 from kmn_jax.pose import RIGHT, THRESHOLDS
 
@@ -25,11 +25,13 @@ def test_settings_differ_in_what_their_names_say() -> None:
     numbers = {"one": 1, "two": 2, "eight": 8}
     for name, config in SETTINGS.items():
         crops = config.search.crops
-        base = THOROUGH if "thorough" in name else DetectConfig()
+        base = next((known for word, known in (("thorough", THOROUGH), ("fast", FAST)) if word in name), DetectConfig())
         draws = [number for word, number in numbers.items() if f"{word} draw" in name] or [base.search.crops.num_draws]
-        points = [int(number.replace(",", "")) for number in re.findall(r"([\d,]+) points", name)] or [None]
+        points = [int(number.replace(",", "")) for number in re.findall(r"([\d,]+) points", name)]
+        points = points or [base.search.crops.num_points]
         assert (crops.num_draws, crops.num_points) == (draws[0], points[0])
-        assert replace(config, search=base.search) == base
+        patience = {"patience 4": 4, "all finely": None}.get(name.split(", ")[-1], base.patience)
+        assert replace(config, search=base.search) == replace(base, patience=patience)
 
 
 def test_a_setting_is_what_is_searched_with(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,7 +99,7 @@ def test_what_was_searched_before_an_interruption_counts(monkeypatch: pytest.Mon
 
 
 def test_bad_input_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InputError, match="no settings are called 'none': choose among one draw"):
+    with pytest.raises(InputError, match="no settings are called 'none': choose among fast"):
         run(Options(settings=("none", PLAIN)))
     with pytest.raises(InputError, match="'as it is', which others are compared with, is missing"):
         run(Options(settings=("one draw",)))

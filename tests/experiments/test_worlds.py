@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from experiments.bins import LEAST_VISIBLE, WorldImage, world_images
+from experiments.calibrate import as_given
 from experiments.detect_bins import Tally
-from experiments.detect_worlds import WorldTally
+from experiments.detect_worlds import WorldTally, scan_of
 from experiments.test_sets import SPLIT
 from experiments.worlds import FAMILIES, TARGETS, VALIDATION, build_worlds, kind_of
 from experiments.worst_images import WorstImages
@@ -79,6 +80,39 @@ def test_images_come_with_their_scans(folder: Path, model: Model, images: list[W
     assert first.errors(first.truth).argmin(axis=1).tolist() == list(range(len(first.truth)))
     with pytest.raises(InputError, match="build_data worlds"):
         next(world_images(folder / "models", model))
+
+
+def test_scans_are_cut_out_around_copies(images: list[WorldImage]) -> None:
+    for image in images[:1] + images[4:5]:  # of one copy or two, and of four in a row
+        whole, cut = image.cloud(), image.cloud(0.1)
+        assert (whole.depth, whole.camera, cut.camera) == (None, None, None)
+        np.testing.assert_array_equal(whole.points, image.scan.points)
+        surface = np.concatenate([image.part.points @ T[:3, :3].T + T[:3, 3] for T in image.truth])
+        kept = {tuple(point) for point in cut.points}
+        some = np.concatenate([whole.points[:: len(whole.points) // 200], cut.points[:: len(cut.points) // 50 + 1]])
+        near = np.linalg.norm(surface[None] - some[:, None], axis=2).min(axis=1) < 0.1 * image.part.diameter
+        assert [tuple(point) in kept for point in some] == near.tolist()
+        assert 0.05 < near.mean() < 0.95
+    assert not len(images[3].cloud(0.1).points)
+
+
+def test_known_worlds_are_given_as_scans_come(images: list[WorldImage]) -> None:
+    assert as_given(images[0], 0) is images[0].scan
+    sizes = [len(as_given(images[0], row).points) for row in (1, 2)]
+    assert sizes[0] == len(images[0].scan.points) > sizes[1] > 0
+    assert len(as_given(images[3], 2).points) == len(images[3].scan.points)  # without a copy nothing is cut
+
+
+def test_worlds_are_given_in_the_form_that_is_asked_for(images: list[WorldImage]) -> None:
+    present, absent = images[0], images[3]
+    assert scan_of(present, "images") is present.scan
+    whole, cut = scan_of(present, "clouds"), scan_of(present, "cut-outs")
+    assert whole is not None
+    assert cut is not None
+    assert (whole.camera, len(whole.points)) == (None, len(present.scan.points))
+    assert len(present.cloud(0.1).points) < len(cut.points) < len(whole.points)
+    assert scan_of(absent, "clouds") is not None
+    assert scan_of(absent, "cut-outs") is None
 
 
 def test_counts(images: list[WorldImage]) -> None:

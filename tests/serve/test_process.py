@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 
 from kmn_jax.cli import main
+from kmn_jax.detection import FAST
 from kmn_jax.errors import InputError
 from kmn_jax.objects import Part
 from kmn_jax.serve import ServeConfig
@@ -203,6 +204,7 @@ def test_detect_sends_all_of_a_request_to_a_server(tmp_path: Path, capsys: pytes
     outputs = {flag: tmp_path / name for flag, name in (("--json", "a.json"), ("--bop-csv", "a.csv"))}
     flags = {"--object": part, "--scene": scene, "--camera": camera, "--background": empty, "--units": "m", **outputs}
     flags |= {"--save-picture": tmp_path / "a.png", "--roi": "0,0,0,1,1,1", "--plane": "always", "--random-seed": 5}
+    flags |= {"--effort": "fast"}
     given = [str(text) for pair in flags.items() for text in pair] + ["--at", "-1,2,3", "--at", "4,5,6"]
     (tmp_path / "private").mkdir()
     with running(tmp_path / "private") as server:
@@ -211,6 +213,7 @@ def test_detect_sends_all_of_a_request_to_a_server(tmp_path: Path, capsys: pytes
         (asked,) = server.known.asked
         assert asked["content"] == scene.read_bytes()
         assert asked["unit"] == "m"
+        assert asked["config"] == FAST
         np.testing.assert_array_equal(asked["at"], [[-1, 2, 3], [4, 5, 6]])
         options = asked["background"]
         assert (options.roi, options.remove_plane) == ((0, 0, 0, 1, 1, 1), "always")

@@ -12,7 +12,7 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 import pytest
 
-from kmn_jax.detection import THOROUGH, as_json
+from kmn_jax.detection import FAST, THOROUGH, as_json
 from kmn_jax.objects import Part
 from kmn_jax.serve import ServeConfig, detect_on_server
 from kmn_jax.serve._app import detect
@@ -258,7 +258,7 @@ def test_the_page_and_the_document_say_what_there_is(server: Running) -> None:
     assert (status, headers["Location"]) == (307, "/docs")
 
 
-def test_thorough_searches_are_so(server: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_searches_take_the_effort_that_is_asked_for(server: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     configs = []
 
     def detect(self: object, *_: object, **__: object) -> object:
@@ -266,9 +266,10 @@ def test_thorough_searches_are_so(server: Running, monkeypatch: pytest.MonkeyPat
         return FOUND
 
     monkeypatch.setattr(type(server.known), "detect", detect)
-    for thorough in ("true", "false"):
-        assert server.send("POST", "/detect", object=b"solid", scene=SCAN, thorough=thorough)[0] == 200
-    assert configs == [THOROUGH, server.known.config]
+    for effort in ("fast", "usual", "thorough"):
+        assert server.send("POST", "/detect", object=b"solid", scene=SCAN, effort=effort)[0] == 200
+    assert configs == [FAST, server.known.config, THOROUGH]
+    assert server.send("POST", "/detect", object=b"solid", scene=SCAN, effort="more")[0] == 422
 
 
 def test_it_says_that_it_is_ready_when_all_is_compiled(tmp_path: Path) -> None:
