@@ -341,7 +341,7 @@ def _made_of(options: Options, model: Model) -> str:
     folders = [str(folder) for folder in (options.bins, options.worlds, options.known_worlds)]
     settings = DetectConfig().search_of(model.config)
     fits = options.folds, options.members, options.absent_weight  # which decide what is reported
-    return repr((options.method, folders, options.every, fits, model_digest(model), EVIDENCE, settings))
+    return repr((options.method, folders, options.every, fits, model_digest(model), EVIDENCE, settings, _MARGINS))
 
 
 def calibrate(options: Options) -> dict[str, Any]:

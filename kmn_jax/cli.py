@@ -56,7 +56,7 @@ class Request:
     plane: Literal["auto", "always", "never"] = "auto"
     """Whether to leave out the largest plane, what is behind it, and a bin's walls; auto: if larger than the object."""
     effort: Literal["fast", "usual", "thorough"] = "usual"
-    """fast: half of the time, and a few copies fewer are found; thorough: some three times the time, and more are."""
+    """fast: half of the time, and perhaps a few copies fewer; thorough: some three times the time, and a few more."""
     sensor: str | None = None
     """X,Y,Z of the sensor in the scene's frame; the origin unless given."""
     base_camera: Path | None = None
