@@ -17,7 +17,7 @@ from experiments.test_sets import SPLIT
 from experiments.worlds import NAMES, TARGETS, kind_of
 from kmn_jax.bop import BopDataset, BopFrame, BopInstance, FrameKey
 from kmn_jax.data import load_models
-from kmn_jax.detection import Scene, bin_content, make_scene, symmetry_transforms
+from kmn_jax.detection import Scene, bin_content, make_scene, near_surface, symmetry_transforms
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import measured_points
 from kmn_jax.io import Scan
@@ -86,19 +86,9 @@ class WorldImage(TrueImage):
 
     def cloud(self, margin: float | None = None) -> Scan:
         """Return the scan as a cloud; with a margin, in diameters, what is so near to the surface of a copy alone."""
-        from scipy.spatial import cKDTree
-
         points = self.scan.points
         if margin is not None:
-            near = margin * self.part.diameter
-            surface = cKDTree(self.part.points)
-            kept = np.zeros(len(points), dtype=bool)
-            for pose in self.truth:
-                local = (points - pose[:3, 3]) @ pose[:3, :3]
-                inside = (local >= self.part.minimum - near) & (local <= self.part.maximum + near)
-                rows = np.flatnonzero(inside.all(axis=1))
-                kept[rows] |= np.isfinite(surface.query(local[rows], distance_upper_bound=near)[0])
-            points = points[kept]
+            points = points[near_surface(points, self.part.points, self.truth, margin * self.part.diameter)]
         return Scan(points, None, None, None, self.scan.unit)
 
 

@@ -17,6 +17,7 @@ from kmn_jax.detection._calibration import (
     vouched,
 )
 from kmn_jax.detection._canonical import canonical_pose
+from kmn_jax.detection._coverage import near_surface
 from kmn_jax.detection._crop_search import (
     CropPoses,
     CropSearchConfig,
@@ -163,6 +164,7 @@ __all__ = [
     "map_real",
     "map_rows",
     "matches_of",
+    "near_surface",
     "network_prediction",
     "picture_agreement",
     "placed",

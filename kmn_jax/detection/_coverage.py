@@ -64,17 +64,32 @@ def unexplained(
     rows: Bool[np.ndarray, " r"], scene: Scene, part: Part, T_camera_object: Float[np.ndarray, "k 4 4"]
 ) -> Bool[np.ndarray, " r"]:
     """Return which of a scene's chosen points lie near to the part's surface at none of the poses."""
+    size = min(len(part.points), _SURFACE_POINTS)
+    near = EXPLAINED * part.diameter + float(np.sqrt(part.area / size))
+    result = rows.copy()
+    result[rows] = ~near_surface(scene.points[rows], part.points[:size], T_camera_object.astype(np.float64), near)
+    return result
+
+
+def near_surface(
+    points: Float[np.ndarray, "n 3"],
+    surface: Float[np.ndarray, "m 3"],
+    T_camera_object: Float[np.ndarray, "k 4 4"],
+    near: float,
+) -> Bool[np.ndarray, " n"]:
+    """Return which points are nearer than `near` to one of those of an object's surface, at any of the poses."""
     from scipy.spatial import cKDTree
 
-    left = np.flatnonzero(rows)
-    size = min(len(part.points), _SURFACE_POINTS)
-    surface, near = cKDTree(part.points[:size]), EXPLAINED * part.diameter + float(np.sqrt(part.area / size))
-    for pose in T_camera_object.astype(np.float64):
-        local = into(pose, scene.points[left])
-        inside = np.flatnonzero(((local >= part.minimum - near) & (local <= part.maximum + near)).all(axis=1))
-        distance, _ = surface.query(local[inside], distance_upper_bound=near)
+    left, tree = np.arange(len(points)), cKDTree(surface)
+    low, high = surface.min(axis=0) - near, surface.max(axis=0) + near
+    for pose in T_camera_object:
+        local = into(pose, points[left])
+        inside = np.flatnonzero(((local >= low) & (local <= high)).all(axis=1))
+        distance, _ = tree.query(local[inside], distance_upper_bound=near)
         left = np.delete(left, inside[np.isfinite(distance)])
-    return np.isin(np.arange(len(rows)), left)
+    result = np.ones(len(points), dtype=bool)
+    result[left] = False
+    return result
 
 
 def to_search(state: Coverage, scene: Scene, part: Part, patience: int | None) -> Bool[np.ndarray, " r"]:
