@@ -6,9 +6,9 @@ ARG PYTHON=3.12
 FROM python:${PYTHON}-slim-bookworm
 ARG EXTRAS=serve
 
-# What open3d needs of the system, as in .ci/environment.
+# What open3d and lightgbm need of the system, as in .ci/environment.
 RUN apt-get update \
-    && apt-get install -y -qq --no-install-recommends libusb-1.0-0 libgl1 libegl1 libx11-6 libidn2-0 libudev1 \
+    && apt-get install -y -qq --no-install-recommends libusb-1.0-0 libgl1 libegl1 libx11-6 libidn2-0 libudev1 libgomp1 \
     && rm -rf /var/lib/apt/lists/*
 
 WORKDIR /build

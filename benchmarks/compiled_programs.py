@@ -21,11 +21,13 @@ from kmn_jax.detection import (
     DepthImage,
     DevicePart,
     bin_poses,
+    device_calibration,
+    load_probabilities,
     poses_in_crop,
     search_crop,
 )
 from kmn_jax.geometry import Intrinsics, PaddedCloud
-from kmn_jax.models import RELEASED_CONFIG, Compute, KeyMatchNetConfig, load_pretrained, model_structure
+from kmn_jax.models import RELEASED_CONFIG, Compute, KeyMatchNetConfig, load_pretrained, model_structure, released_file
 from kmn_jax.objects import PartArrays
 from kmn_jax.simulate import Surfels
 from kmn_jax.train import create_state, data_mesh, jit_train_step
@@ -36,7 +38,6 @@ _CLOUD = 32_768  # points of a scan
 _IMAGE = (600, 972)  # pixels of the small test set's images
 _SURFELS = 2048  # of an object on the device
 _SYMMETRIES, _LOOK_ALIKES = 1, 24
-_HIDDEN_UNITS = 24  # of the model of probabilities
 COMPUTES: tuple[Compute, ...] = ("float32", "tf32", "bfloat16")
 
 
@@ -135,9 +136,9 @@ def _bin(seeds: int) -> Program:
 
         number = _array((), jnp.float32)
         image = DepthImage(_array(_IMAGE, jnp.float32), Intrinsics(*[number] * 6))
-        columns, units = _array((len(EVIDENCE),), jnp.float32), _array((_HIDDEN_UNITS,), jnp.float32)
-        hidden = _array((len(EVIDENCE), _HIDDEN_UNITS), jnp.float32)
-        calibration = CalibrationArrays(columns, columns, hidden, units, units, columns, number)
+        stored = load_probabilities(released_file("small").with_suffix(".calibration.json"), EVIDENCE)
+        own = device_calibration(stored.found)
+        calibration = CalibrationArrays(*(_array(leaf.shape, leaf.dtype) for leaf in own))
         inside, key = _array(_IMAGE, jnp.bool_), _array((2,), jnp.uint32)
         return jax.jit(solve), _on(devices, (model.parameters, part, calibration, image, inside, key))
 

@@ -3,7 +3,7 @@
 Poses are searched in the validation bins (`python -m experiments.build_data validation-bins`), whose objects the
 network was not trained with, and with `--worlds` and `--known-worlds` in the whole scans of world bins; in every second
 image also a part that is not there. Of the known worlds two thirds of the scans are given as clouds, half of these cut
-out around the copies, as scans often come. A small model of the evidence is fitted to whether they are right. Each
+out around the copies, as scans often come. A model of the evidence is fitted to whether they are right. Each
 object's probabilities are also predicted by a model that was fitted without it, which gives the reliability that is
 printed. The model of poses as they are found is fitted first: it chooses which of them are refined, here as in
 detection. Of refined poses detection reports one for each place: the one that a third model holds for the most
@@ -36,6 +36,7 @@ from experiments.test_sets import SPLIT
 from kmn_jax.detection import (
     COMPANY,
     EVIDENCE,
+    TREE_SETTINGS,
     Calibration,
     Candidates,
     DetectConfig,
@@ -48,6 +49,7 @@ from kmn_jax.detection import (
     device_part,
     expected_calibration_error,
     fit_calibration,
+    fit_logistic,
     make_scene,
     probabilities_bytes,
     refined_candidates,
@@ -64,8 +66,8 @@ from kmn_jax.report import check_target, print_table, write_json
 
 _LOOSE = DetectConfig(reported=0.03)  # refines more than detection does, so that the fit sees what is just refused
 _SCALE_RIDGE = 1e-4  # hardly any: it makes probabilities too modest
-_COLUMNS = ("evidence", "error", "largest_error", "object", "search", "narrowed", "refined", "reported")  # of poses
-_MARGINS = (0.02, 0.3)  # diameters: so much of what is around copies is left in scans that are cut out
+_COLUMNS = ("evidence", "error", "largest_error", "object", "search", "narrowed", "refined", "reported")  # of fits
+_MARGINS = (0.1, 0.4)  # diameters: so much of what is around copies is left in scans that are cut out
 _KINDS = 100  # more than the families of parts in a folder of world bins
 SHIPPED = Path(__file__).parent.parent / "kmn_jax" / "pretrained" / "small.calibration.json"
 
@@ -81,7 +83,7 @@ class Options:
     known_worlds: Path | None = None  # the same, of parts that the network was trained with: no scale is fitted to it
     every: int = 1  # use every so many images of `bins`
     folds: int = 5
-    members: int = 5  # fits, whose mean is the model of refined poses
+    members: int = 3  # fits, whose mean is the model of refined poses
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
     output: Path = SHIPPED  # the calibration
     candidates: Path | None = None  # .npz file to write the candidates to, or to read them from if it exists
@@ -116,6 +118,7 @@ class Search(NamedTuple):
             "object": np.full(len(poses), self.number),
             "search": np.full(len(poses), self.row),
             "narrowed": np.full(len(poses), self.scene.is_narrowed),
+            "T_camera_object": found.T_camera_object[found.usable],  # to try other evidence on
         }
 
 
@@ -131,7 +134,7 @@ def collect(options: Options, model: Model) -> dict[str, np.ndarray]:
         parts.append(search.columns(found))
         proposed.append(_with_poses(found))
     poses = _joined(parts)
-    chooser = fit_calibration(poses["evidence"], poses["error"] < THRESHOLD, EVIDENCE)
+    chooser = _model(poses | {"refined": np.zeros(len(poses["error"]), dtype=bool)}, options)
     finer, parts = [], []
     for search, found in zip(_searches(options, model), proposed, strict=True):
         choice = chosen(found, chooser, search.on_device, _LOOSE)
@@ -253,9 +256,14 @@ def _model(poses: dict[str, np.ndarray], options: Options) -> Calibration:
 
 
 def _weights(poses: dict[str, np.ndarray], options: Options) -> Float[np.ndarray, " s"]:
-    """Return how much poses count: refined ones of absent parts more than others."""
+    """Return how much poses count: refined ones of absent parts more than others, and all less if an object has many.
+
+    What objects, or families of parts, have in common is to be learned, not what those few are like that have most.
+    """
     absent = ~np.isfinite(poses["error"])
-    return np.where(absent & poses["refined"], options.absent_weight, 1.0)
+    _, which, counts = np.unique(poses["object"], return_inverse=True, return_counts=True)
+    weights = np.where(absent & poses["refined"], options.absent_weight, 1.0) / np.sqrt(counts[which])
+    return weights * (len(weights) / max(weights.sum(), 1e-9))
 
 
 class Fitted(NamedTuple):
@@ -281,7 +289,7 @@ def fit(poses: dict[str, np.ndarray], options: Options) -> Fitted:
     judged = np.ones_like(right)
     if poses["reported"].any():
         judged = poses["reported"]
-        scale = fit_calibration(held_out[judged, None], right[judged], ("logit",), hidden_units=0, ridge=_SCALE_RIDGE)
+        scale = fit_logistic(held_out[judged, None], right[judged], ("logit",), _SCALE_RIDGE)
         if scale.weights[0] <= 0:
             raise InputError("poses are right no more often where models of other objects say so: give more bins")
         model, held_out = model.scaled(scale.weights[0], scale.bias), scale.weights[0] * held_out + scale.bias
@@ -305,7 +313,7 @@ def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], 
         raise InputError("in no image of the bins are two poses reported: give more bins")
 
     def model_of(rows: Bool[np.ndarray, " s"]) -> Calibration:
-        return fit_calibration(columns[rows], right[rows], COMPANY, hidden_units=0, ridge=_SCALE_RIDGE)
+        return fit_logistic(columns[rows], right[rows], COMPANY, _SCALE_RIDGE)
 
     held_out = logits.copy()
     for names in _folds(poses, options):
@@ -340,7 +348,7 @@ def _made_of(options: Options, model: Model) -> str:
     """Say what candidates are made of."""
     folders = [str(folder) for folder in (options.bins, options.worlds, options.known_worlds)]
     settings = DetectConfig().search_of(model.config)
-    fits = options.folds, options.members, options.absent_weight  # which decide what is reported
+    fits = options.folds, options.members, options.absent_weight, TREE_SETTINGS  # which decide what is reported
     return repr((options.method, folders, options.every, fits, model_digest(model), EVIDENCE, settings, _MARGINS))
 
 
@@ -353,8 +361,9 @@ def calibrate(options: Options) -> dict[str, Any]:
     if options.candidates is not None and options.candidates.exists():
         with np.load(options.candidates) as stored:
             poses = dict(stored)
-        if str(poses.pop("made_of", "")) != made_of or set(poses) != set(_COLUMNS):
+        if str(poses.pop("made_of", "")) != made_of or not set(_COLUMNS) <= set(poses):
             raise InputError(f"{options.candidates} holds poses of other bins, weights or settings: remove it")
+        poses = {name: poses[name] for name in _COLUMNS}
     else:
         poses = collect(options, network)
         if options.candidates is not None:

@@ -41,7 +41,7 @@ ALLOWED = {
 }
 
 # flax.nnx itself loads optax, so optax cannot be on this list.
-HEAVY = ("open3d", "trimesh", "mujoco", "grain", "viser", "torch", "orbax", "fastapi", "uvicorn")
+HEAVY = ("open3d", "trimesh", "mujoco", "grain", "viser", "torch", "orbax", "lightgbm", "fastapi", "uvicorn")
 PUBLIC = {
     "kmn_jax": [],
     "kmn_jax.pose": ["kabsch", "ransac", "icp", "add", "adi", "mssd", "PoseResult"],

@@ -10,7 +10,6 @@ from kmn_jax.detection._calibration import (
     chance_calibration_error,
     company,
     expected_calibration_error,
-    fit_calibration,
     load_probabilities,
     probabilities_bytes,
     reliability,
@@ -59,6 +58,7 @@ from kmn_jax.detection._device_part import DevicePart, device_part, same_place, 
 from kmn_jax.detection._estimator import PoseEstimator
 from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
 from kmn_jax.detection._export import export_estimator
+from kmn_jax.detection._fitting import TREE_SETTINGS, fit_calibration, fit_logistic
 from kmn_jax.detection._foreground import ForegroundOptions, OrientedBox, foreground
 from kmn_jax.detection._frames import into, placed
 from kmn_jax.detection._grasps import Conflict, Copy, grasp_conflict, with_grasps
@@ -91,6 +91,7 @@ __all__ = [
     "MOST_POINTS",
     "NUM_SEEDS",
     "THOROUGH",
+    "TREE_SETTINGS",
     "BinMargins",
     "BinPoses",
     "BinPosesConfig",
@@ -152,6 +153,7 @@ __all__ = [
     "export_estimator",
     "find_poses_in_crop",
     "fit_calibration",
+    "fit_logistic",
     "foreground",
     "gather_evidence",
     "grasp_conflict",

@@ -55,7 +55,8 @@ class BinPoses(NamedTuple):
 
 def device_calibration(calibration: Calibration) -> CalibrationArrays:
     """Put a calibration onto the device."""
-    return CalibrationArrays(*(jnp.asarray(leaf, dtype=jnp.float32) for leaf in calibration.arrays()))
+    leaves = calibration.arrays()
+    return CalibrationArrays(*(jnp.asarray(leaf, jnp.float32 if leaf.dtype.kind == "f" else None) for leaf in leaves))
 
 
 @partial(jax.jit, static_argnames=("graphdef", "config"))

@@ -1,7 +1,8 @@
-"""How probable it is that a pose is right, from the evidence for and against it: a model with a few hidden units.
+"""How probable it is that a pose is right, from the evidence for and against it: a model of many small trees.
 
 What one number says depends on others: that a surface goes on in its plane speaks against a pose, but less so if much
-of a curved surface agrees. Hidden units learn that; ridges and the clipping of what was never seen keep them tame.
+of a curved surface agrees. Trees learn that, and what is more extreme than all that was seen counts as the most
+extreme of it. `fit_calibration` fits them.
 """
 
 from __future__ import annotations
@@ -15,62 +16,71 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Float32, Int
 
 from kmn_jax.errors import InputError, shown
 from kmn_jax.limits import parse_json
 
-_RIDGE = 1e-3  # on standardised weights: that which predicts kinds of objects best that were not fitted to
-_HIDDEN = 24  # units: chosen in the same way
-_EXTREME = 1.0  # percent of the poses on either side, beyond which evidence counts as no more extreme
-_ITERATIONS = 500
+_DECIMALS = 6  # of the values of leaves, in files
+_TREE_FIELDS = ("columns", "thresholds", "values")  # of `Calibration`
+_MOST_TREES, _MOST_LEAVES = 20_000, 1024  # of a model in a file, and of a tree
+_LARGEST = 1e6  # of numbers that are added up
 
 
 class CalibrationArrays(NamedTuple):
-    """A `Calibration` as arrays, of f columns and u hidden units."""
+    """A `Calibration` as arrays, of f columns and t trees of one depth.
 
-    low: Float[Array | np.ndarray, " f"]
-    high: Float[Array | np.ndarray, " f"]
-    hidden_weights: Float[Array | np.ndarray, "f u"]
-    hidden_bias: Float[Array | np.ndarray, " u"]
-    hidden_slopes: Float[Array | np.ndarray, " u"]
-    weights: Float[Array | np.ndarray, " f"]
+    The nodes of a tree are those of its levels one after the other, n = 2^depth - 1 of them, and l = n + 1 leaves.
+    """
+
+    weights: Float[Array | np.ndarray, " w"]  # w = f, or none
     bias: Float[Array | np.ndarray, ""]
+    columns: Int[Array | np.ndarray, "t n"]  # that nodes look at
+    thresholds: Float32[Array | np.ndarray, "t n"]  # up to which it is the left branch that is taken
+    values: Float[Array | np.ndarray, "t l"]  # of leaves
 
     def logits(self, evidence: Float[Array | np.ndarray, "*s f"], xp: ModuleType = jnp) -> Any:
         """Return the log odds that poses are right, by the functions of jax.numpy or numpy."""
-        rows = xp.clip(evidence.reshape(-1, len(self.low)), self.low[None], self.high[None])
-        hidden = xp.tanh(rows @ self.hidden_weights + self.hidden_bias[None])
-        return (rows @ self.weights + hidden @ self.hidden_slopes + self.bias).reshape(evidence.shape[:-1])
+        rows = evidence.reshape(-1, evidence.shape[-1])
+        linear = rows @ self.weights if len(self.weights) else 0
+        trees, leaves = self.values.shape
+        said: Any = 0
+        if trees:
+            tree, branch = xp.arange(trees, dtype=xp.int32)[None], xp.zeros((len(rows), trees), dtype=xp.int32)
+            for first in (2**level - 1 for level in range(leaves.bit_length() - 1)):  # nodes before those of a level
+                node = (leaves - 1) * tree + first + branch
+                column, threshold = (
+                    xp.take(of.reshape(-1), node, mode="clip") for of in (self.columns, self.thresholds)
+                )
+                is_right = xp.take_along_axis(rows, column, axis=1) > threshold
+                branch = 2 * branch + is_right.astype(xp.int32)
+            said = xp.take(self.values.reshape(-1), leaves * tree + branch, mode="clip").sum(axis=1)
+        return (linear + said + self.bias).reshape(evidence.shape[:-1])
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A model of evidence x: log odds = bias + weights x + slopes tanh(hidden weights x + hidden bias).
+    """A model of evidence x: log odds = bias + weights x + the values of the leaves that x leads to, one of each tree.
 
-    Evidence is clipped to `low` and `high` first. Without hidden units it is a logistic model.
+    Trees are as in `CalibrationArrays`. Without any it is a logistic model.
     """
 
     names: tuple[str, ...]  # of the columns of the evidence
-    weights: tuple[float, ...]
+    weights: tuple[float, ...]  # one for each, or none
     bias: float
-    low: tuple[float, ...] = ()  # no bounds unless given
-    high: tuple[float, ...] = ()
-    hidden_weights: tuple[tuple[float, ...], ...] = ()  # of each hidden unit
-    hidden_bias: tuple[float, ...] = ()
-    hidden_slopes: tuple[float, ...] = ()
+    columns: tuple[tuple[int, ...], ...] = ()  # of the nodes of each tree
+    thresholds: tuple[tuple[float, ...], ...] = ()
+    values: tuple[tuple[float, ...], ...] = ()  # of the leaves of each tree
 
     def arrays(self) -> CalibrationArrays:
-        """Return the model as arrays of float64."""
-        count = len(self.names)
+        """Return the model as arrays, thresholds in the precision of evidence."""
+        trees, leaves = len(self.values), len(self.values[0]) if self.values else 1
         return CalibrationArrays(
-            np.array(self.low or (-np.inf,) * count),
-            np.array(self.high or (np.inf,) * count),
-            np.array(self.hidden_weights).reshape(-1, count).T,
-            np.array(self.hidden_bias),
-            np.array(self.hidden_slopes),
             np.array(self.weights),
             np.array(self.bias),
+            np.array(self.columns, dtype=np.int32).reshape(trees, leaves - 1),
+            np.array(self.thresholds, dtype=np.float32).reshape(trees, leaves - 1),
+            np.array(self.values, dtype=np.float64).reshape(trees, leaves),
         )
 
     def probability(self, evidence: Float[np.ndarray, "s f"]) -> Float[np.ndarray, " s"]:
@@ -79,84 +89,16 @@ class Calibration:
 
     def logit(self, evidence: Float[np.ndarray, "s f"]) -> Float[np.ndarray, " s"]:
         """Return the logarithm of the odds that each pose is right."""
-        return self.arrays().logits(evidence.astype(np.float64), np)
+        return self.arrays().logits(evidence, np)
 
     def scaled(self, factor: float, offset: float) -> Calibration:
         """Return the model whose logits are these times a factor, plus an offset."""
-        weights, slopes = ([factor * value for value in values] for values in (self.weights, self.hidden_slopes))
-        return replace(self, weights=tuple(weights), hidden_slopes=tuple(slopes), bias=factor * self.bias + offset)
-
-
-def fit_calibration(
-    evidence: Float[np.ndarray, "s f"],
-    right: Bool[np.ndarray, " s"],
-    names: Sequence[str],
-    weights: Float[np.ndarray, " s"] | None = None,
-    hidden_units: int = _HIDDEN,
-    ridge: float = _RIDGE,
-    members: int = 1,
-) -> Calibration:
-    """Fit to poses of which it is known whether they are right; `weights` count some as several.
-
-    With several `members` the model is the mean of as many fits that begin elsewhere: each errs in its own way about
-    kinds of objects that it has not seen. The same arguments give the same model on one machine. Raises InputError if
-    all are right or all are wrong.
-    """
-    from scipy.optimize import minimize
-
-    if right.all() or not right.any():
-        raise InputError(
-            f"{int(right.sum())} of {len(right)} poses are right: to fit probabilities, some must be wrong"
+        return replace(
+            self,
+            weights=tuple(factor * weight for weight in self.weights),
+            values=tuple(tuple(factor * value for value in leaves) for leaves in self.values),
+            bias=factor * self.bias + offset,
         )
-    counts = np.ones(len(right)) if weights is None else weights
-    low, high = np.percentile(
-        evidence.astype(np.float64), (_EXTREME, 100 - _EXTREME), axis=0, weights=counts, method="inverted_cdf"
-    )
-    clipped = np.clip(evidence.astype(np.float64), low, high)
-    mean, scale = clipped.mean(axis=0), clipped.std(axis=0)
-    scale = np.where(scale > 0, scale, 1)
-    columns = (clipped - mean) / scale
-    counts = counts / counts.sum()
-    f, u = columns.shape[1], hidden_units
-    shapes = ((f, u), (u,), (u,), (f,), ())
-    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
-    ridges = np.concatenate([np.full(f * u, ridge), np.zeros(u), np.full(u + f, ridge), np.zeros(1)])
-
-    def unpacked(solution: Float[np.ndarray, " g"]) -> list[Float[np.ndarray, "..."]]:
-        parts = np.split(solution, ends[:-1])
-        return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
-
-    def loss(solution: Float[np.ndarray, " g"]) -> tuple[float, Float[np.ndarray, " g"]]:
-        inner, inner_bias, slopes, direct, bias = unpacked(solution)
-        hidden = np.tanh(columns @ inner + inner_bias)
-        logits = hidden @ slopes + columns @ direct + bias
-        value = counts @ (np.logaddexp(0, logits) - right * logits) + ridges @ solution**2 / 2
-        error = counts * (_logistic(logits) - right)
-        back = np.outer(error, slopes) * (1 - hidden**2)
-        slope = [columns.T @ back, back.sum(axis=0), hidden.T @ error, columns.T @ error, error.sum()]
-        return float(value), np.concatenate([part.reshape(-1) for part in slope]) + ridges * solution
-
-    def member(random_seed: int) -> list[Float[np.ndarray, "..."]]:
-        start, rng = np.zeros(ends[-1]), np.random.default_rng(random_seed)
-        start[: f * u] = rng.normal(size=f * u) / np.sqrt(f)
-        start[f * u + u : f * u + 2 * u] = rng.normal(size=u) / 4
-        options = {"maxiter": _ITERATIONS, "maxfun": 2 * _ITERATIONS, "ftol": 1e-12, "gtol": 1e-8}
-        return unpacked(minimize(loss, start, jac=True, method="L-BFGS-B", options=options).x)
-
-    fitted = [member(random_seed) for random_seed in range(members)]
-    inner, inner_bias, slopes = (np.concatenate(parts, axis=-1) for parts in list(zip(*fitted, strict=True))[:3])
-    slopes, direct, bias = slopes / members, *(np.mean([parts[row] for parts in fitted], axis=0) for row in (3, 4))
-    inner, direct = inner / scale[:, None], direct / scale
-    return Calibration(
-        tuple(names),
-        tuple(direct.tolist()),
-        float(bias - direct @ mean),
-        tuple(low.tolist()),
-        tuple(high.tolist()),
-        tuple(map(tuple, inner.T.tolist())),
-        tuple((inner_bias - mean @ inner).tolist()),
-        tuple(slopes.tolist()),
-    )
 
 
 def _logistic(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
@@ -232,8 +174,11 @@ def vouched(logits: Float[np.ndarray, " s"], together: Calibration) -> Float[np.
 
 
 def probabilities_bytes(probabilities: Probabilities) -> bytes:
-    """Return the JSON form."""
-    return (json.dumps(asdict(probabilities), indent=1) + "\n").encode()
+    """Return the JSON form, in which the values of leaves are rounded."""
+    models = asdict(probabilities)
+    for model in models.values():
+        model["values"] = [[round(value, _DECIMALS) for value in leaves] for leaves in model["values"]]
+    return (json.dumps(models) + "\n").encode()
 
 
 def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
@@ -242,6 +187,8 @@ def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
     try:
         stored = parse_json(Path(path).read_text(encoding="utf-8"))
         models = {name: _read(stored[name]) for name in evidence if name == "found" or name in stored}
+    except _OtherKindError:
+        raise InputError(f"{path} is a calibration of another kind: fit it again with experiments.calibrate") from None
     except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path} is not a readable calibration: {shown(error)}") from None
     if {name: model.names for name, model in models.items()} != evidence:
@@ -249,27 +196,48 @@ def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
     return Probabilities(**models)
 
 
+class _OtherKindError(Exception):
+    """A file is of a time when models were no trees."""
+
+
 def _read(stored: dict[str, Any]) -> Calibration:
-    """Return a model of its JSON form. Raises KeyError, TypeError, ValueError or OverflowError if it is none."""
-    names = tuple(str(name) for name in stored["names"])
-
-    def numbers(name: str, count: int, given: Any = None) -> tuple[float, ...]:
-        values = tuple(float(value) for value in (stored[name] if given is None else given))
-        if len(values) != count or not np.isfinite(values).all():
-            raise ValueError(f"{name} are not {count} finite numbers")
-        return values
-
-    units = len(stored["hidden_slopes"])
-    if len(stored["hidden_weights"]) != units:
-        raise ValueError(f"hidden_weights are not those of {units} units")
-    low, high = (numbers(name, len(names) if stored[name] else 0) for name in ("low", "high"))
+    """Return a model of its JSON form. Raises KeyError, TypeError, ValueError, OverflowError or _OtherKindError."""
+    names = tuple(str(name) for name in _listed(stored["names"]))
+    if not any(name in stored for name in _TREE_FIELDS):
+        raise _OtherKindError
+    columns, thresholds, values = (_listed(stored[name]) for name in _TREE_FIELDS)
+    leaves = len(_listed(values[0])) if values else 2
+    if not len(columns) == len(thresholds) == len(values) <= _MOST_TREES:
+        raise ValueError(f"its trees are not the same in all parts, or more than {_MOST_TREES}")
+    if not 2 <= leaves <= _MOST_LEAVES or leaves & (leaves - 1):
+        raise ValueError(f"a tree has {leaves} leaves, no power of two up to {_MOST_LEAVES}")
+    weights = _numbers("weights", stored["weights"], len(names) if stored["weights"] else 0, _LARGEST)
+    (bias,) = _numbers("bias", [stored["bias"]], 1, _LARGEST)
     return Calibration(
-        names=names,
-        weights=numbers("weights", len(names)),
-        bias=numbers("bias", 1, [stored["bias"]])[0],
-        low=low,
-        high=high,
-        hidden_weights=tuple(numbers("hidden_weights", len(names), row) for row in stored["hidden_weights"]),
-        hidden_bias=numbers("hidden_bias", units),
-        hidden_slopes=numbers("hidden_slopes", units),
+        names,
+        weights,
+        bias,
+        tuple(_places(row, leaves - 1, len(names)) for row in columns),
+        tuple(_numbers("thresholds", row, leaves - 1, float(np.finfo(np.float32).max)) for row in thresholds),
+        tuple(_numbers("values", row, leaves, _LARGEST) for row in values),
     )
+
+
+def _listed(given: Any) -> list[Any]:
+    if not isinstance(given, list):
+        raise TypeError(f"{shown(given)} is no list")
+    return given
+
+
+def _numbers(name: str, given: Any, count: int, largest: float) -> tuple[float, ...]:
+    if len(_listed(given)) != count or not all(
+        type(value) in (int, float) and abs(value) <= largest for value in given
+    ):
+        raise ValueError(f"{name} are not {count} numbers up to {largest:g}")
+    return tuple(map(float, given))
+
+
+def _places(given: Any, count: int, limit: int) -> tuple[int, ...]:
+    if len(_listed(given)) != count or not all(type(place) is int and 0 <= place < limit for place in given):
+        raise ValueError(f"columns are not {count} of the {limit} that there are")
+    return tuple(given)

@@ -264,7 +264,8 @@ def chosen(
     exact: Calibration | None = None,
 ) -> Selection:
     """Choose among the most probable candidates, by an `exact` model where there is one."""
-    probability = calibration.probability(found.evidence)
+    probability = np.zeros(len(found.usable))
+    probability[found.usable] = calibration.probability(found.evidence[found.usable])
     possible = found.usable & (probability >= config.reported)
     ranked = np.argsort(-np.where(possible, probability, -1), kind="stable")[:_CONSIDERED]
     rows = np.pad(ranked, (0, _CONSIDERED - len(ranked)), mode="edge")

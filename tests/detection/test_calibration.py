@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,7 @@ import pytest
 
 from kmn_jax.detection import (
     COMPANY,
+    TREE_SETTINGS,
     Calibration,
     CalibrationArrays,
     Probabilities,
@@ -20,6 +23,7 @@ from kmn_jax.detection import (
     device_calibration,
     expected_calibration_error,
     fit_calibration,
+    fit_logistic,
     load_probabilities,
     probabilities_bytes,
     reliability,
@@ -39,7 +43,7 @@ def drawn(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_a_known_model_is_found_and_its_probabilities_hold() -> None:
     evidence, right = drawn(20_000)
-    fitted = fit_calibration(evidence, right, NAMES, hidden_units=0, ridge=3e-3)
+    fitted = fit_logistic(evidence, right, NAMES, ridge=3e-3)
     np.testing.assert_allclose(fitted.weights[:2], [2, -0.3], rtol=0.1)
     np.testing.assert_allclose(fitted.bias + fitted.weights[2], 1, atol=0.15)
     assert expected_calibration_error(fitted.probability(evidence), right) < 0.02
@@ -57,67 +61,121 @@ def test_few_poses_have_a_calibration_error_by_chance_alone() -> None:
 
 def test_a_weight_counts_a_pose_several_times() -> None:
     evidence, right = drawn(500)
-    twice = np.concatenate([evidence, evidence[:100]]), np.concatenate([right, right[:100]])
-    weights = np.where(np.arange(500) < 100, 2.0, 1.0)
-    # Columns are scaled by the spread of what is given, so the ridge differs a little.
-    weighted, repeated = (
-        fit_calibration(*given, hidden_units=0) for given in ((evidence, right, NAMES, weights), (*twice, NAMES))
-    )
-    np.testing.assert_allclose(weighted.probability(evidence), repeated.probability(evidence), atol=0.01)
+    weights = np.where(right, 3.0, 1.0)
+    plain, same, weighted = (fit_calibration(evidence, right, NAMES, given) for given in (None, np.ones(500), weights))
+    assert plain == same
+    # Fits are right on average: of what is said of poses, as often as they count.
+    for fitted, counts in ((plain, np.ones(500)), (weighted, weights)):
+        said, share = (np.average(values, weights=counts) for values in (fitted.probability(evidence), right))
+        np.testing.assert_allclose(said, share, atol=0.01)
+    assert np.average(right, weights=weights) > right.mean() + 0.1
 
 
-def test_hidden_units_learn_what_depends_on_another_number() -> None:
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"weights": np.zeros(500)}, "weights of poses must be above zero"),
+        ({"weights": np.full(500, np.nan)}, "weights of poses must be above zero"),
+        ({"members": 0}, "members = 0 must be 1 or more"),
+        ({"names": NAMES[:2]}, "2 names are not those of 3 columns"),
+    ],
+)
+def test_what_cannot_be_fitted_is_refused(change: dict[str, Any], message: str) -> None:
+    evidence, right = drawn(500)
+    with pytest.raises(InputError, match=message):
+        fit_calibration(evidence, right, **({"names": NAMES} | change))
+
+
+def test_a_missing_library_of_the_system_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Broken:
+        def find_spec(self, name: str, *_: object) -> None:
+            if name == "lightgbm":
+                raise OSError("libgomp.so.1: cannot open shared object file")
+
+    monkeypatch.delitem(sys.modules, "lightgbm", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Broken(), *sys.meta_path])
+    evidence, right = drawn(20)
+    with pytest.raises(InputError, match=r"cannot be loaded \(libgomp.* `sudo apt-get install libgomp1` on Debian"):
+        fit_calibration(evidence, right, NAMES)
+
+
+def test_trees_learn_what_depends_on_another_number() -> None:
     rng = np.random.default_rng(1)
     evidence = rng.uniform(-1, 1, (3_000, 2)).astype(np.float32)
     right = evidence.prod(axis=1) > 0
-    plain, hidden = (fit_calibration(evidence, right, ("a", "b"), hidden_units=units) for units in (0, 24))
+    plain, trees = fit_logistic(evidence, right, ("a", "b"), 1e-3), fit_calibration(evidence, right, ("a", "b"))
     assert ((plain.probability(evidence) > 0.5) == right).mean() < 0.7
-    assert ((hidden.probability(evidence) > 0.5) == right).mean() > 0.9
-    assert fit_calibration(evidence, right, ("a", "b")) == hidden
+    assert ((trees.probability(evidence) > 0.5) == right).mean() > 0.9
+    assert fit_calibration(evidence, right, ("a", "b")) == trees
+
+
+def test_trees_are_those_that_were_fitted_to_the_last_tie() -> None:
+    import lightgbm
+
+    rng = np.random.default_rng(2)
+    # Few numbers that differ by the least that single precision can tell: thresholds lie next to them.
+    near = np.float32(1) + np.finfo(np.float32).eps * rng.integers(0, 6, (1_000, 1))
+    evidence = np.concatenate([near, rng.integers(-3, 3, (1_000, 2))], axis=1).astype(np.float32)
+    right = rng.random(1_000) < 1 / (1 + np.exp(-evidence[:, 1] - 1e7 * (evidence[:, 0] - 1)))
+    fitted = fit_calibration(evidence, right, NAMES)
+    booster = lightgbm.train(TREE_SETTINGS | {"seed": 0}, lightgbm.Dataset(evidence, right))
+    expected = booster.predict(evidence, raw_score=True)
+    np.testing.assert_allclose(fitted.logit(evidence), expected, atol=1e-3)
+    assert np.std(expected) > 0.5
 
 
 def test_what_was_never_seen_counts_as_the_most_extreme_that_was() -> None:
     evidence, right = drawn(2_000)
     fitted = fit_calibration(evidence, right, NAMES)
-    far = np.array([[100.0, 3.0, 1.0], [1e6, 3.0, 1.0]], dtype=np.float32)
-    first, second = fitted.probability(far)
-    assert first == second == fitted.probability(np.array([[fitted.high[0], 3.0, 1.0]]))[0]
+    highest = float(evidence[:, 0].max())
+    probability = fitted.probability(np.array([[x, 3.0, 1.0] for x in (highest, 1e30, np.inf)], dtype=np.float32))
+    assert probability[0] == probability[1] == probability[2] > 0.9
 
 
 def test_the_device_gives_the_same_probabilities() -> None:
     evidence, right = drawn(500)
-    fitted = fit_calibration(evidence, right, NAMES)
-    logits = jax.jit(CalibrationArrays.logits)(device_calibration(fitted), jnp.asarray(evidence))
-    np.testing.assert_allclose(jax.nn.sigmoid(logits), fitted.probability(evidence), atol=1e-5)
+    for fitted in (fit_calibration(evidence, right, NAMES), fit_logistic(evidence, right, NAMES, 1e-3)):
+        logits = jax.jit(CalibrationArrays.logits)(device_calibration(fitted), jnp.asarray(evidence))
+        np.testing.assert_allclose(jax.nn.sigmoid(logits), fitted.probability(evidence), atol=1e-5)
+
+
+def test_a_scaled_model_says_the_same_in_other_odds() -> None:
+    evidence, right = drawn(500)
+    fitted = replace(fit_calibration(evidence, right, NAMES), weights=(0.5, 0.0, -1.0))
+    np.testing.assert_allclose(fitted.scaled(0.8, 0.3).logit(evidence), 0.8 * fitted.logit(evidence) + 0.3, atol=1e-9)
 
 
 def test_evidence_that_decides_completely_keeps_finite_weights() -> None:
     evidence = np.array([[0.0], [0.1], [0.9], [1.0]], dtype=np.float32)
-    fitted = fit_calibration(evidence, np.array([False, False, True, True]), ("only",))
+    fitted = fit_logistic(evidence, np.array([False, False, True, True]), ("only",), 1e-3)
     assert np.isfinite(fitted.weights).all()
     assert (fitted.probability(evidence) > 0.5).tolist() == [False, False, True, True]
-    with pytest.raises(InputError, match="4 of 4 poses are right"):
-        fit_calibration(evidence, np.ones(4, dtype=bool), ("only",))
+
+
+@pytest.mark.parametrize("outcome", [True, False])
+def test_poses_that_are_all_right_or_all_wrong_teach_nothing(outcome: bool) -> None:
+    evidence, right = np.zeros((4, 1), dtype=np.float32), np.full(4, outcome)
+    message = f"{4 * outcome} of 4 poses are right"
+    with pytest.raises(InputError, match=message):
+        fit_calibration(evidence, right, ("only",))
+    with pytest.raises(InputError, match=message):
+        fit_logistic(evidence, right, ("only",), 1e-3)
+
+
+def test_few_poses_are_as_probable_as_the_share_that_is_right() -> None:
+    evidence, right = drawn(20)
+    np.testing.assert_allclose(fit_calibration(evidence, right, NAMES).probability(evidence), right.mean(), atol=1e-6)
 
 
 def test_several_members_are_the_mean_of_their_models() -> None:
-    evidence, right = drawn(300)
-    one, three = (fit_calibration(evidence, right, NAMES, hidden_units=4, members=members) for members in (1, 3))
-    assert len(three.hidden_slopes) == 12
-    own = CalibrationArrays(*three.arrays())
-    # The first of the three is the one that is fitted alone, up to what all share.
-    first = own._replace(
-        hidden_weights=own.hidden_weights[:, :4],
-        hidden_bias=own.hidden_bias[:4],
-        hidden_slopes=3 * own.hidden_slopes[:4],
+    evidence, right = drawn(3_000)
+    one, three = (fit_calibration(evidence, right, NAMES, members=members) for members in (1, 3))
+    assert len(three.values) > 2.5 * len(one.values)  # which leaves out trees of one leaf
+    first = replace(
+        three, **{name: getattr(three, name)[: len(one.values)] for name in ("columns", "thresholds", "values")}
     )
-    hidden = [
-        model.logits(evidence, np) - evidence.clip(model.low, model.high) @ model.weights - model.bias
-        for model in (first, one.arrays())
-    ]
-    np.testing.assert_allclose(*hidden, rtol=1e-6, atol=1e-9)
-    losses = [np.mean(np.logaddexp(0, np.where(right, -1, 1) * model.logit(evidence))) for model in (one, three)]
-    assert losses[1] < losses[0] + 0.02
+    np.testing.assert_allclose(3 * first.logit(evidence), one.logit(evidence), atol=1e-3)
+    assert np.abs(three.logit(evidence) - one.logit(evidence)).max() > 0.01
 
 
 def test_sure_poses_vouch_for_others_of_their_scene() -> None:
@@ -149,9 +207,13 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.calibration.json"
     logistic = Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25)
     together = Calibration(COMPANY, (1.1, 1.2), -4.8)
-    fitted = Probabilities(logistic, fit_calibration(*drawn(100), NAMES), logistic, together)
+    fitted = Probabilities(logistic, fit_calibration(*drawn(200), NAMES), logistic, together)
     path.write_bytes(probabilities_bytes(fitted))
-    assert load_probabilities(path, NAMES) == fitted
+    loaded = load_probabilities(path, NAMES)
+    evidence, _ = drawn(200)
+    np.testing.assert_allclose(loaded.found.logit(evidence), fitted.found.logit(evidence), rtol=1e-12)
+    np.testing.assert_allclose(loaded.refined.logit(evidence), fitted.refined.logit(evidence), atol=3e-4)
+    assert probabilities_bytes(loaded) == path.read_bytes()
     with pytest.raises(InputError, match="of other evidence"):
         load_probabilities(path, ("first",))
     path.write_bytes(probabilities_bytes(replace(fitted, together=logistic)))
@@ -167,7 +229,20 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
         "[]",
         "{}",
         '{"found": 1, "refined": {"names": ["first"], "weights": ["x"], "bias": 0}, "exact": 1, "together": 1}',
-        _damaged(fitted),
+        _damaged(fitted, values=[0.0] * 15),  # a leaf is missing
+        _damaged(fitted, values=[0.0] * 15 + [1e7]),
+        _damaged(fitted, values=[0.0] * 15 + [True]),
+        _damaged(fitted, values={str(leaf): 0.0 for leaf in range(16)}),
+        _damaged(fitted, columns=[3] * 15),  # there are three columns
+        _damaged(fitted, columns=[0.5] * 15),
+        _damaged(fitted, columns="0" * 15),
+        _damaged(fitted, thresholds=[1e39] * 15),  # not in single precision
+        _damaged(fitted, thresholds=["x"] * 15),
+        _damaged(fitted, columns=[0] * 14, thresholds=[0.0] * 14, values=[0.0] * 15),
+        _damaged(fitted, columns=[0] * 7, thresholds=[0.0] * 7, values=[0.0] * 8),  # the others are deeper
+        _damaged(fitted, columns=[0] * 2047, thresholds=[0.0] * 2047, values=[0.0] * 2048),
+        _damaged(fitted, columns=[], thresholds=[], values=[0.0]),
+        _without_a_tree(fitted),
         probabilities_bytes(fitted).decode().replace("-2.5", f"1{'0' * 400}"),
     ):
         path.write_text(content)
@@ -175,8 +250,28 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
             load_probabilities(path, ("first",))
 
 
-def _damaged(fitted: Probabilities) -> str:
-    """Return a file whose hidden units lack a number."""
+def test_a_file_of_the_time_before_trees_says_what_to_do(tmp_path: Path) -> None:
+    path = tmp_path / "a.calibration.json"
+    own = Calibration(NAMES, (1.0, 0.0, 0.0), 0.0)
+    stored = json.loads(probabilities_bytes(Probabilities(own, own, own, Calibration(COMPANY, (1.0, 1.0), 0.0))))
+    for model in stored.values():
+        for name in ("columns", "thresholds", "values"):
+            del model[name]
+        model |= {"hidden_weights": [], "hidden_bias": [], "hidden_slopes": []}
+    path.write_text(json.dumps(stored))
+    with pytest.raises(InputError, match="of another kind: fit it again with"):
+        load_probabilities(path, NAMES)
+
+
+def _without_a_tree(fitted: Probabilities) -> str:
     stored = json.loads(probabilities_bytes(fitted))
-    del stored["refined"]["hidden_weights"][3][-1]
+    del stored["refined"]["thresholds"][-1]
+    return json.dumps(stored)
+
+
+def _damaged(fitted: Probabilities, **parts: Any) -> str:
+    """Return a file of which the first tree of one model holds something else."""
+    stored = json.loads(probabilities_bytes(fitted))
+    for name, values in parts.items():
+        stored["refined"][name][0] = values
     return json.dumps(stored)

@@ -16,11 +16,11 @@ from kmn_jax.errors import InputError
 _OBJECTS, _POSES, _COLUMNS = 10, 60, 12
 
 
-def drawn(random_seed: int, objects: int = _OBJECTS, spread: float = 1.0) -> dict[str, np.ndarray]:
-    """Return poses of objects, for each of which evidence is another wherever it is right."""
+def drawn(random_seed: int, objects: int = _OBJECTS, spread: float = 1.0, oddity: float = 1.0) -> dict[str, np.ndarray]:
+    """Return poses of objects; `oddity` is by how much the evidence of one differs from that of others."""
     rng = np.random.default_rng(random_seed)
     right = rng.random((objects, _POSES)) < 0.3
-    strange = rng.normal(size=(objects, 1, _COLUMNS))
+    strange = oddity * rng.normal(size=(objects, 1, _COLUMNS))
     evidence = right[..., None] + strange + spread * rng.normal(size=(objects, _POSES, _COLUMNS))
     return {
         "evidence": evidence.reshape(-1, _COLUMNS),
@@ -37,12 +37,13 @@ def few_columns(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_probabilities_hold_for_objects_of_other_kinds() -> None:
-    poses = drawn(0)
+    kinds = {"spread": 2.0, "oddity": 3.0}
+    poses = drawn(0, **kinds)
     options = Options(absent_weight=1.0, members=2)
     model, _, results = fit(poses, options)
     plain, _, _ = fit(poses | {"reported": np.zeros(len(poses["error"]), dtype=bool)}, options)
     assert results["summary"]["poses"] == poses["reported"].sum()
-    fresh = drawn(1, 50)
+    fresh = drawn(1, 50, **kinds)
     evidence, right = fresh["evidence"], fresh["error"] < 0.1
     error, before = (expected_calibration_error(fitted.probability(evidence), right) for fitted in (model, plain))
     assert error < 0.7 * before
@@ -93,6 +94,20 @@ def test_absent_parts_count_more_among_refined_poses() -> None:
     found = drawn(0) | {"reported": np.zeros(_OBJECTS * _POSES, dtype=bool)}
     found["refined"] = ~found["refined"]
     np.testing.assert_array_equal(fitted(found, 20), fitted(found, 1))
+
+
+def test_an_object_with_four_times_the_poses_counts_twice() -> None:
+    rows = {"object": np.repeat([3, 7], [100, 25]), "error": np.zeros(125), "refined": np.ones(125, dtype=bool)}
+    weights = calibrate._weights(rows, Options())
+    np.testing.assert_allclose([weights[:100].sum(), weights[100:].sum()], [125 * 2 / 3, 125 / 3])
+    rows["error"][0] = np.inf  # the object is not there
+    first, second = calibrate._weights(rows, Options(absent_weight=3))[:2]
+    np.testing.assert_allclose(first, 3 * second)
+
+
+def test_poses_of_one_object_predict_no_other() -> None:
+    with pytest.raises(InputError, match="0 of 0 poses are right"):
+        fit(drawn(0, 1), Options(members=1))
 
 
 def test_crops_without_poses_are_dropped_and_the_others_keep_theirs() -> None:
