@@ -50,6 +50,7 @@ from kmn_jax.detection import (
     expected_calibration_error,
     fit_calibration,
     fit_logistic,
+    load_lightgbm,
     make_scene,
     probabilities_bytes,
     refined_candidates,
@@ -356,6 +357,7 @@ def calibrate(options: Options) -> dict[str, Any]:
     """Fit, write and print. Raises InputError if there is nothing to fit to."""
     for target in (options.json, options.picture):
         check_target(target)
+    load_lightgbm()  # before an hour of searching, not after
     network = load_pretrained() if options.model is None else load_model(options.model)
     made_of = _made_of(options, network)
     if options.candidates is not None and options.candidates.exists():

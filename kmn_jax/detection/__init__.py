@@ -58,7 +58,7 @@ from kmn_jax.detection._device_part import DevicePart, device_part, same_place, 
 from kmn_jax.detection._estimator import PoseEstimator
 from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
 from kmn_jax.detection._export import export_estimator
-from kmn_jax.detection._fitting import TREE_SETTINGS, fit_calibration, fit_logistic
+from kmn_jax.detection._fitting import TREE_SETTINGS, fit_calibration, fit_logistic, load_lightgbm
 from kmn_jax.detection._foreground import ForegroundOptions, OrientedBox, foreground
 from kmn_jax.detection._frames import into, placed
 from kmn_jax.detection._grasps import Conflict, Copy, grasp_conflict, with_grasps
@@ -161,6 +161,7 @@ __all__ = [
     "inside_bin",
     "into",
     "join",
+    "load_lightgbm",
     "load_probabilities",
     "make_scene",
     "map_real",

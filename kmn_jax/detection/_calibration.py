@@ -42,9 +42,8 @@ class CalibrationArrays(NamedTuple):
     def logits(self, evidence: Float[Array | np.ndarray, "*s f"], xp: ModuleType = jnp) -> Any:
         """Return the log odds that poses are right, by the functions of jax.numpy or numpy."""
         rows = evidence.reshape(-1, evidence.shape[-1])
-        linear = rows @ self.weights if len(self.weights) else 0
+        logits = rows @ self.weights if len(self.weights) else xp.zeros(len(rows))
         trees, leaves = self.values.shape
-        said: Any = 0
         if trees:
             tree, branch = xp.arange(trees, dtype=xp.int32)[None], xp.zeros((len(rows), trees), dtype=xp.int32)
             for first in (2**level - 1 for level in range(leaves.bit_length() - 1)):  # nodes before those of a level
@@ -54,8 +53,8 @@ class CalibrationArrays(NamedTuple):
                 )
                 is_right = xp.take_along_axis(rows, column, axis=1) > threshold
                 branch = 2 * branch + is_right.astype(xp.int32)
-            said = xp.take(self.values.reshape(-1), leaves * tree + branch, mode="clip").sum(axis=1)
-        return (linear + said + self.bias).reshape(evidence.shape[:-1])
+            logits = logits + xp.take(self.values.reshape(-1), leaves * tree + branch, mode="clip").sum(axis=1)
+        return (logits + self.bias).reshape(evidence.shape[:-1])
 
 
 @dataclass(frozen=True)
@@ -213,6 +212,8 @@ def _read(stored: dict[str, Any]) -> Calibration:
         raise ValueError(f"a tree has {leaves} leaves, no power of two up to {_MOST_LEAVES}")
     weights = _numbers("weights", stored["weights"], len(names) if stored["weights"] else 0, _LARGEST)
     (bias,) = _numbers("bias", [stored["bias"]], 1, _LARGEST)
+    if not weights and not values:
+        raise ValueError("it has neither weights nor trees")
     return Calibration(
         names,
         weights,

@@ -271,7 +271,9 @@ def chosen(
     rows = np.pad(ranked, (0, _CONSIDERED - len(ranked)), mode="edge")
     usable = possible[rows] & (np.arange(_CONSIDERED) < len(ranked))
     poses = found.T_camera_object[rows]
-    score = probability if exact is None else exact.probability(found.evidence)
+    score = probability.copy()
+    if exact is not None:
+        score[possible] = exact.probability(found.evidence[possible])
     given = jax.device_put((poses, score[rows].astype(np.float32), usable))
     few: Selection = jax.device_get(select_poses(given[0], given[1], given[2], part))
 

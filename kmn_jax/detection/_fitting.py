@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,19 @@ TREE_SETTINGS: dict[str, Any] = {
 }
 
 
+def load_lightgbm() -> ModuleType:
+    """Import lightgbm and return it. Raises InputError if a library of the system is missing."""
+    try:
+        import lightgbm
+    except OSError as error:
+        raise InputError(
+            f"lightgbm, which fits probabilities, cannot be loaded ({shown(error)}). If OpenMP is missing, run `sudo"
+            " apt-get install libgomp1` on Debian, `brew install libomp` on macOS"
+        ) from None
+    module: ModuleType = lightgbm
+    return module
+
+
 def fit_calibration(
     evidence: Float[np.ndarray, "s f"],
     right: Bool[np.ndarray, " s"],
@@ -41,24 +55,20 @@ def fit_calibration(
 
     With several `members` the model is the mean of as many fits that draw otherwise: each errs in its own way about
     kinds of objects that it has not seen. Each has up to 300 trees: where none is left to be grown, fewer. The same
-    arguments give the same model on one machine. Raises InputError if all are right or all are wrong, if weights are
-    not above zero, and if lightgbm lacks a library of the system.
+    arguments give the same model on one machine. Raises InputError if all are right or all are wrong, if numbers are
+    not finite or weights not above zero, and if lightgbm lacks a library of the system.
     """
-    try:
-        import lightgbm
-    except OSError as error:
-        raise InputError(
-            f"lightgbm, which fits probabilities, cannot be loaded ({shown(error)}). If OpenMP is missing, run `sudo"
-            " apt-get install libgomp1` on Debian, `brew install libomp` on macOS"
-        ) from None
+    lightgbm = load_lightgbm()
     _check(right)
     require(members >= 1, f"members = {members} must be 1 or more")
-    require(weights is None or bool((weights > 0).all()), "weights of poses must be above zero")
+    counts = np.ones(len(right)) if weights is None else weights
+    require(bool((np.isfinite(counts) & (counts > 0)).all()), "weights of poses must be finite and above zero")
     require(len(names) == evidence.shape[1], f"{len(names)} names are not those of {evidence.shape[1]} columns")
     columns = evidence.astype(np.float32)
+    require(bool(np.isfinite(columns).all()), "evidence must be finite")
     trees: list[dict[str, Any]] = []
     for random_seed in range(members):
-        data = lightgbm.Dataset(columns, right, weight=weights)
+        data = lightgbm.Dataset(columns, right, weight=counts)
         booster = lightgbm.train(TREE_SETTINGS | {"seed": random_seed}, data)
         trees += [tree["tree_structure"] for tree in booster.dump_model()["tree_info"]]
     nodes = 2**_DEPTH - 1

@@ -74,8 +74,10 @@ def test_a_weight_counts_a_pose_several_times() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"weights": np.zeros(500)}, "weights of poses must be above zero"),
-        ({"weights": np.full(500, np.nan)}, "weights of poses must be above zero"),
+        ({"weights": np.zeros(500)}, "weights of poses must be finite and above zero"),
+        ({"weights": np.full(500, np.nan)}, "weights of poses must be finite and above zero"),
+        ({"weights": np.full(500, np.inf)}, "weights of poses must be finite and above zero"),
+        ({"evidence": np.full((500, 3), np.nan)}, "evidence must be finite"),
         ({"members": 0}, "members = 0 must be 1 or more"),
         ({"names": NAMES[:2]}, "2 names are not those of 3 columns"),
     ],
@@ -83,7 +85,7 @@ def test_a_weight_counts_a_pose_several_times() -> None:
 def test_what_cannot_be_fitted_is_refused(change: dict[str, Any], message: str) -> None:
     evidence, right = drawn(500)
     with pytest.raises(InputError, match=message):
-        fit_calibration(evidence, right, **({"names": NAMES} | change))
+        fit_calibration(**({"evidence": evidence, "right": right, "names": NAMES} | change))
 
 
 def test_a_missing_library_of_the_system_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -238,10 +240,14 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
         _damaged(fitted, columns="0" * 15),
         _damaged(fitted, thresholds=[1e39] * 15),  # not in single precision
         _damaged(fitted, thresholds=["x"] * 15),
-        _damaged(fitted, columns=[0] * 14, thresholds=[0.0] * 14, values=[0.0] * 15),
+        _with_trees(fitted, 1, 14),
         _damaged(fitted, columns=[0] * 7, thresholds=[0.0] * 7, values=[0.0] * 8),  # the others are deeper
-        _damaged(fitted, columns=[0] * 2047, thresholds=[0.0] * 2047, values=[0.0] * 2048),
-        _damaged(fitted, columns=[], thresholds=[], values=[0.0]),
+        _with_trees(fitted, 1, 2047),
+        _with_trees(fitted, 1, 0),
+        _with_trees(fitted, 20_001, 1),
+        _with_trees(fitted, 0, 0),  # and no weights
+        _damaged(fitted, values=[np.nan] * 16),
+        _damaged(fitted, values=[np.inf] * 16),
         _without_a_tree(fitted),
         probabilities_bytes(fitted).decode().replace("-2.5", f"1{'0' * 400}"),
     ):
@@ -261,6 +267,14 @@ def test_a_file_of_the_time_before_trees_says_what_to_do(tmp_path: Path) -> None
     path.write_text(json.dumps(stored))
     with pytest.raises(InputError, match="of another kind: fit it again with"):
         load_probabilities(path, NAMES)
+
+
+def _with_trees(fitted: Probabilities, trees: int, nodes: int) -> str:
+    """Return a file in which a model has these trees alone."""
+    stored = json.loads(probabilities_bytes(fitted))
+    rows = {"columns": [0] * nodes, "thresholds": [0.0] * nodes, "values": [0.0] * (nodes + 1)}
+    stored["refined"] |= {name: [row] * trees for name, row in rows.items()}
+    return json.dumps(stored)
 
 
 def _without_a_tree(fitted: Probabilities) -> str:
