@@ -135,7 +135,9 @@ def collect(options: Options, model: Model) -> dict[str, np.ndarray]:
         parts.append(search.columns(found))
         proposed.append(_with_poses(found))
     poses = _joined(parts)
-    chooser = _model(poses | {"refined": np.zeros(len(poses["error"]), dtype=bool)}, options)
+    none = np.zeros(len(poses["error"]), dtype=bool)
+    poses |= {"refined": none, "reported": none}
+    chooser = _model(poses, options)
     finer, parts = [], []
     for search, found in zip(_searches(options, model), proposed, strict=True):
         choice = chosen(found, chooser, search.on_device, _LOOSE)
@@ -154,8 +156,7 @@ def collect(options: Options, model: Model) -> dict[str, np.ndarray]:
         chosen(refined, others[number], on_device, DetectConfig(), exact[number]).kept[refined.usable] & (not is_known)
         for refined, on_device, number, is_known in finer
     ]
-    none = np.zeros(len(poses["error"]), dtype=bool)
-    return _joined([poses | {"refined": none, "reported": none}, fine | {"reported": np.concatenate(reported)}])
+    return _joined([poses, fine | {"reported": np.concatenate(reported)}])
 
 
 def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib import import_module
 from types import ModuleType
 from typing import Any
 
@@ -34,14 +35,12 @@ TREE_SETTINGS: dict[str, Any] = {
 def load_lightgbm() -> ModuleType:
     """Import lightgbm and return it. Raises InputError if a library of the system is missing."""
     try:
-        import lightgbm
+        return import_module("lightgbm")
     except OSError as error:
         raise InputError(
             f"lightgbm, which fits probabilities, cannot be loaded ({shown(error)}). If OpenMP is missing, run `sudo"
             " apt-get install libgomp1` on Debian, `brew install libomp` on macOS"
         ) from None
-    module: ModuleType = lightgbm
-    return module
 
 
 def fit_calibration(
@@ -136,7 +135,5 @@ def fit_logistic(
 
 
 def _check(right: Bool[np.ndarray, " s"]) -> None:
-    if right.all() or not right.any():
-        raise InputError(
-            f"{int(right.sum())} of {len(right)} poses are right: to fit probabilities, some must be wrong"
-        )
+    message = f"{int(right.sum())} of {len(right)} poses are right: to fit probabilities, some must be wrong"
+    require(bool(right.any() and not right.all()), message)
