@@ -56,7 +56,7 @@ from kmn_jax.detection._detect import (
 )
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place, symmetry_transforms
 from kmn_jax.detection._estimator import PoseEstimator
-from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
+from kmn_jax.detection._evidence import EVIDENCE, OF_PICTURE, gather_evidence, picture_evidence
 from kmn_jax.detection._export import export_estimator
 from kmn_jax.detection._fitting import TREE_SETTINGS, fit_calibration, fit_logistic, load_lightgbm
 from kmn_jax.detection._foreground import ForegroundOptions, OrientedBox, foreground
@@ -90,6 +90,7 @@ __all__ = [
     "FAST",
     "MOST_POINTS",
     "NUM_SEEDS",
+    "OF_PICTURE",
     "THOROUGH",
     "TREE_SETTINGS",
     "BinMargins",
@@ -170,6 +171,7 @@ __all__ = [
     "near_surface",
     "network_prediction",
     "picture_agreement",
+    "picture_evidence",
     "placed",
     "pose_notes",
     "poses_at",

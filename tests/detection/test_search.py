@@ -11,6 +11,7 @@ import pytest
 
 from kmn_jax.detection import (
     EVIDENCE,
+    OF_PICTURE,
     Candidates,
     CropPoses,
     CropSearchConfig,
@@ -19,6 +20,7 @@ from kmn_jax.detection import (
     SearchConfig,
     gather_evidence,
     make_scene,
+    picture_evidence,
     search_at,
     spread_seeds,
 )
@@ -165,3 +167,18 @@ def test_rows_are_spread_over_large_masks_too(total: int, count: int) -> None:
     assert real.sum() == min(total, count)
     places = np.arange(count, dtype=np.int64) * total // count if total > count else np.arange(total)
     np.testing.assert_array_equal(np.asarray(rows)[np.asarray(real)], order[places])
+
+
+def test_the_picture_shows_the_same_of_poses_that_were_kept(part: DevicePart, scene: Scene) -> None:
+    poses = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
+    poses[:, 2, 3] = [13, 14, 30]  # the box begins 7.5 nearer, what was measured lies at 6
+    seen = picture_evidence(poses, part, scene, CONFIG.agreement)
+    none = no_poses(CROPS, NETWORK.num_keypoints)
+    there = np.ones(CROPS.num_poses, dtype=bool)
+    for pose, row in zip(poses, seen, strict=True):
+        found = none._replace(
+            poses=none.poses._replace(T_scene_object=np.tile(pose, (len(there), 1, 1)), converged=there)
+        )
+        wanted = gather_evidence(found, part.arrays, part.surfels, scene.image, CONFIG.agreement)[0]
+        np.testing.assert_allclose(row, wanted[np.array([EVIDENCE.index(name) for name in OF_PICTURE])], atol=1e-5)
+    assert np.ptp(seen, axis=0).max() > 0.1

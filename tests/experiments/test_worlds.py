@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.bins import LEAST_VISIBLE, WorldImage, world_images
-from experiments.calibrate import as_given
+from experiments.candidates import as_given
 from experiments.detect_bins import Tally
 from experiments.detect_worlds import WorldTally, scan_of
 from experiments.test_sets import SPLIT

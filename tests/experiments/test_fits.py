@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
-from experiments import calibrate
-from experiments.calibrate import Options, fit, fit_together
-from kmn_jax.detection import Candidates, expected_calibration_error, vouched
+from experiments import fits
+from experiments.fits import FitOptions, fit, fit_together
+from kmn_jax.detection import expected_calibration_error, vouched
 from kmn_jax.errors import InputError
 
 _OBJECTS, _POSES, _COLUMNS = 10, 60, 12
@@ -33,13 +30,13 @@ def drawn(random_seed: int, objects: int = _OBJECTS, spread: float = 1.0, oddity
 
 @pytest.fixture(autouse=True)
 def few_columns(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(calibrate, "EVIDENCE", tuple(f"column {number}" for number in range(_COLUMNS)))
+    monkeypatch.setattr(fits, "EVIDENCE", tuple(f"column {number}" for number in range(_COLUMNS)))
 
 
 def test_probabilities_hold_for_objects_of_other_kinds() -> None:
     kinds = {"spread": 2.0, "oddity": 3.0}
     poses = drawn(0, **kinds)
-    options = Options(absent_weight=1.0, members=2)
+    options = FitOptions(absent_weight=1.0, members=2)
     model, _, results = fit(poses, options)
     plain, _, _ = fit(poses | {"reported": np.zeros(len(poses["error"]), dtype=bool)}, options)
     assert results["summary"]["poses"] == poses["reported"].sum()
@@ -68,7 +65,7 @@ def test_poses_of_scenes_where_the_part_is_vouch_for_each_other() -> None:
         "narrowed": narrowed.reshape(-1),
         "reported": reported.reshape(-1),
     }
-    model, held_out, results = fit_together(rows, logits, Options())
+    model, held_out, results = fit_together(rows, logits, FitOptions())
     assert model.weights[1] > 0.1
     own, outcome = logits[rows["reported"]], rows["error"][rows["reported"]] < 0.1
     assert results["summary"]["poses"] == len(own) == len(held_out)
@@ -80,7 +77,7 @@ def test_poses_of_scenes_where_the_part_is_vouch_for_each_other() -> None:
     assert (held_out > own).mean() > 0.2
     np.testing.assert_allclose(vouched(own[:poses], model), held_out[:poses], atol=0.3)  # of others' scenes
     with pytest.raises(InputError, match="two poses"):
-        fit_together(rows | {"narrowed": np.zeros(right.size, dtype=bool)}, logits, Options())
+        fit_together(rows | {"narrowed": np.zeros(right.size, dtype=bool)}, logits, FitOptions())
 
 
 def test_absent_parts_count_more_among_refined_poses() -> None:
@@ -88,7 +85,7 @@ def test_absent_parts_count_more_among_refined_poses() -> None:
     poses = drawn(0, 25, spread=6.0) | {"reported": np.zeros(25 * _POSES, dtype=bool)}
 
     def fitted(poses: dict[str, np.ndarray], weight: float) -> np.ndarray:
-        return fit(poses, Options(absent_weight=weight, folds=2, members=2)).model.probability(poses["evidence"])
+        return fit(poses, FitOptions(absent_weight=weight, folds=2, members=2)).model.probability(poses["evidence"])
 
     assert fitted(poses, 20).mean() < 0.8 * fitted(poses, 1).mean()
     found = drawn(0) | {"reported": np.zeros(_OBJECTS * _POSES, dtype=bool)}
@@ -98,40 +95,16 @@ def test_absent_parts_count_more_among_refined_poses() -> None:
 
 def test_an_object_with_four_times_the_poses_counts_twice() -> None:
     rows = {"object": np.repeat([3, 7], [100, 25]), "error": np.zeros(125), "refined": np.ones(125, dtype=bool)}
-    weights = calibrate._weights(rows, Options())
+    weights = fits._weights(rows, FitOptions())
     np.testing.assert_allclose([weights[:100].sum(), weights[100:].sum()], [125 * 2 / 3, 125 / 3])
     rows["error"][0] = np.inf  # the object is not there
-    first, second = calibrate._weights(rows, Options(absent_weight=3))[:2]
+    first, second = fits._weights(rows, FitOptions(absent_weight=3))[:2]
     np.testing.assert_allclose(first, 3 * second)
 
 
 def test_poses_of_one_object_predict_no_other() -> None:
     with pytest.raises(InputError, match="0 of 0 poses are right"):
-        fit(drawn(0, 1), Options(members=1))
-
-
-def test_crops_without_poses_are_dropped_and_the_others_keep_theirs() -> None:
-    usable = np.array([False, False, True, False, False, False, False, True])  # two poses of each of four crops
-    crop = np.repeat(np.arange(4), 2)
-    said: Any = {"logits": np.arange(4)}
-    found = Candidates(
-        np.arange(8)[:, None], usable, np.arange(8)[:, None] * 10, np.arange(8), crop, said, crop[::2] * 7
-    )
-    few = calibrate._with_poses(found)
-    np.testing.assert_array_equal(few.evidence[:, 0], [20, 30, 60, 70])
-    np.testing.assert_array_equal(few.usable, [True, False, False, True])
-    np.testing.assert_array_equal(few.crop, [0, 0, 1, 1])
-    np.testing.assert_array_equal(few.found["logits"], [1, 3])
-    np.testing.assert_array_equal(few.seed_rows, [7, 21])
-    none = calibrate._with_poses(found._replace(usable=np.zeros(8, dtype=bool)))
-    assert (len(none.usable), len(none.seed_rows)) == (2, 1)
-
-
-def test_candidates_of_other_bins_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "candidates.npz"
-    np.savez(path, allow_pickle=False, made_of=np.array("others"), **drawn(0))
-    with pytest.raises(InputError, match="holds poses of other bins, weights or settings: remove it"):
-        calibrate.calibrate(Options(candidates=path, output=tmp_path / "a.json"))
+        fit(drawn(0, 1), FitOptions(members=1))
 
 
 def test_where_probable_poses_are_wrong_no_scale_is_fitted() -> None:
@@ -142,4 +115,4 @@ def test_where_probable_poses_are_wrong_no_scale_is_fitted() -> None:
     poses["evidence"] = np.outer(np.where(right, 1.0, -1.0) * turned, np.ones(_COLUMNS))
     poses["object"] = poses["object"] % 2
     with pytest.raises(InputError, match="give more bins"):
-        fit(poses, Options(absent_weight=1.0, folds=2, members=2))
+        fit(poses, FitOptions(absent_weight=1.0, folds=2, members=2))

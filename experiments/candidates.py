@@ -1,0 +1,282 @@
+"""Poses to fit probabilities to: what is found of parts in images whose truth is known, and what speaks for each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, cast
+
+import jax
+import numpy as np
+import tyro
+from jaxtyping import Float32
+from tqdm import tqdm
+
+from experiments.bins import TrueImage, WorldImage, bin_images, world_images
+from experiments.fits import FitOptions, by_largest_error, held_out_models, model_of
+from experiments.fpfh import fpfh_poses
+from experiments.test_sets import SPLIT
+from kmn_jax.detection import (
+    EVIDENCE,
+    OF_PICTURE,
+    TREE_SETTINGS,
+    Candidates,
+    DetectConfig,
+    DevicePart,
+    Scene,
+    SearchConfig,
+    chosen,
+    device_part,
+    make_scene,
+    picture_evidence,
+    refined_candidates,
+    search_at,
+    seeds_over,
+)
+from kmn_jax.errors import InputError
+from kmn_jax.io import Scan
+from kmn_jax.models import Model
+from kmn_jax.objects import Part, model_digest
+
+_LOOSE = DetectConfig(reported=0.03)  # refines more than detection does, so that the fit sees what is just refused
+_COLUMNS = (  # of what is stored
+    "evidence",
+    "error",
+    "largest_error",
+    "object",
+    "search",
+    "narrowed",
+    "T_camera_object",
+    "refined",
+    "reported",
+)
+_MARGINS = (0.1, 0.4)  # diameters: so much of what is around copies is left in scans that are cut out
+_KINDS = 100  # more than the families of parts in a folder of world bins
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What is searched, with what, and in which images."""
+
+    model: Annotated[Path | None, tyro.conf.Positional] = None  # .safetensors; the released model unless given
+    method: Literal["kmn_jax", "FPFH"] = "kmn_jax"
+    bins: Path = Path("outputs/validation_bins")  # folder with datasets in BOP format
+    worlds: Path | None = None  # folder of world bins to fit on, too: outputs/worlds/validation
+    known_worlds: Path | None = None  # the same, of parts that the network was trained with: no scale is fitted to it
+    every: int = 1  # use every so many images of `bins`
+
+
+class Search(NamedTuple):
+    """One image and the part that is searched in it."""
+
+    image: TrueImage
+    part: Part  # the image's own, or its stranger
+    on_device: DevicePart
+    scene: Scene
+    row: int  # of all searches
+    number: int  # that searches of one object, or of one family of parts, share
+    is_known: bool  # whether the network was trained with such parts
+
+    def columns(self, found: Candidates) -> dict[str, np.ndarray]:
+        """Return evidence, errors and object of poses; those of a part that is not there have no finite errors."""
+        poses = self.scene.T_scene_camera @ found.T_camera_object[found.usable]
+        errors = [
+            errors.min(axis=1, initial=np.inf)
+            for errors in (self.image.errors(poses), self.image.largest_errors(poses))
+        ]
+        if self.part is not self.image.part:
+            errors = [np.full_like(error, np.inf) for error in errors]
+        return {
+            "evidence": found.evidence[found.usable],
+            "error": errors[0],
+            "largest_error": errors[1],
+            "object": np.full(len(poses), self.number),
+            "search": np.full(len(poses), self.row),
+            "narrowed": np.full(len(poses), self.scene.is_narrowed),
+            "T_camera_object": found.T_camera_object[found.usable],  # to try other evidence on
+        }
+
+
+class _Searched(NamedTuple):
+    """What choosing among the poses of a search wants."""
+
+    on_device: DevicePart
+    is_known: bool
+
+
+def candidates(stored: Path | None, sources: Sources, fits: FitOptions, network: Model) -> dict[str, np.ndarray]:
+    """Return evidence, outcome, object and search of all poses, and whether they are refined, and what is judged.
+
+    What is `stored` is not searched again, and written there if it was not. If it holds other kinds of evidence, its
+    poses are judged anew: of them, what was refined was chosen by the evidence of before. Raises InputError if what is
+    stored is of other bins, weights or settings.
+    """
+    made_of = _made_of(sources, fits, network)
+    if stored is None or not stored.exists():
+        poses = collect(sources, fits, network)
+    else:
+        with np.load(stored) as file:
+            poses = dict(file)
+        if str(poses.pop("made_of", "")) != made_of or set(poses) != {*_COLUMNS, "names"}:
+            raise InputError(f"{stored} holds poses of other bins, weights or settings: remove it")
+        names = tuple(poses.pop("names").tolist())
+        if names == EVIDENCE:
+            return poses
+        poses = judged_anew(poses, names, sources, fits, network)
+    if stored is not None:
+        whole = stored.with_suffix(".part.npz")
+        np.savez(whole, allow_pickle=False, made_of=np.array(made_of), names=np.array(EVIDENCE), **poses)
+        whole.replace(stored)
+    return poses
+
+
+def collect(sources: Sources, fits: FitOptions, network: Model) -> dict[str, np.ndarray]:
+    """Search and refine. Images are read twice, as they do not all fit into memory."""
+    config = DetectConfig().search_of(network.config)
+    proposed, parts = [], []
+    for search in _searches(sources, network):
+        found = _proposed(search, network, config, sources.method)
+        parts.append(search.columns(found))
+        proposed.append(_with_poses(found))
+    poses = _joined(parts)
+    none = np.zeros(len(poses["error"]), dtype=bool)
+    poses |= {"refined": none, "reported": none}
+    chooser = model_of(poses, fits)
+    parts, searched = [], {}
+    for search, found in zip(_searches(sources, network), proposed, strict=True):
+        choice = chosen(found, chooser, search.on_device, _LOOSE)
+        rows = np.flatnonzero(choice.kept | choice.contenders)
+        searched[search.row] = _Searched(search.on_device, search.is_known)
+        if len(rows):
+            parts.append(search.columns(refined_candidates(search.on_device, search.scene, found, rows, 0, config)))
+    fine = _joined(parts)
+    none = np.zeros(len(fine["error"]), dtype=bool)
+    return _with_reported(_joined([poses, fine | {"refined": ~none, "reported": none}]), searched, fits)
+
+
+def judged_anew(
+    poses: dict[str, np.ndarray], names: tuple[str, ...], sources: Sources, fits: FitOptions, network: Model
+) -> dict[str, np.ndarray]:
+    """Return poses with evidence of today: what comes of pictures is computed, what comes of crops is that of `names`.
+
+    Raises InputError if evidence that comes of crops is not among the names.
+    """
+    if not set(EVIDENCE) <= {*names, *OF_PICTURE}:
+        raise InputError("the stored poses lack evidence that comes of crops: remove the file, to search them again")
+    old, searched = poses["evidence"], {}
+    evidence = np.zeros((len(old), len(EVIDENCE)), dtype=np.float32)
+    of_picture = np.array([EVIDENCE.index(name) for name in OF_PICTURE])
+    for column, name in enumerate(EVIDENCE):
+        if name not in OF_PICTURE:
+            evidence[:, column] = old[:, names.index(name)]
+    config = DetectConfig().search_of(network.config)
+    for search in _searches(sources, network):
+        searched[search.row] = _Searched(search.on_device, search.is_known)
+        rows = np.flatnonzero(poses["search"] == search.row)
+        if len(rows):
+            seen = picture_evidence(poses["T_camera_object"][rows], search.on_device, search.scene, config.agreement)
+            evidence[np.ix_(rows, of_picture)] = seen
+    return _with_reported(poses | {"evidence": evidence}, searched, fits)
+
+
+def _with_reported(
+    poses: dict[str, np.ndarray], searched: dict[int, _Searched], fits: FitOptions
+) -> dict[str, np.ndarray]:
+    """Return poses with what detection reports of each search, by models that do not know its object."""
+    fine = {name: values[poses["refined"]] for name, values in poses.items()}
+    others, exact = (
+        {name: fitted for names, fitted in held_out_models(rows, fits) for name in names}
+        for rows in (fine, by_largest_error(fine))
+    )
+    reported = np.zeros(len(poses["error"]), dtype=bool)
+    for row, (on_device, is_known) in searched.items():
+        rows = np.flatnonzero((poses["search"] == row) & poses["refined"])
+        if len(rows) and not is_known:
+            number = int(poses["object"][rows[0]])
+            found = _choosable(poses["T_camera_object"][rows], poses["evidence"][rows])
+            reported[rows] = chosen(found, others[number], on_device, DetectConfig(), exact[number]).kept
+    return poses | {"reported": reported}
+
+
+def _choosable(poses: Float32[np.ndarray, "s 4 4"], evidence: Float32[np.ndarray, "s f"]) -> Candidates:
+    """Return candidates that can be chosen among, and nothing else."""
+    none = np.zeros(len(poses), dtype=np.int32)
+    return Candidates(poses, np.ones(len(poses), dtype=bool), evidence, none, none, cast(Any, None), none)
+
+
+def _joined(columns: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    return {name: np.concatenate([part[name] for part in columns]) for name in columns[0]}
+
+
+def _searches(sources: Sources, network: Model) -> Iterator[Search]:
+    """Yield all images with their parts, and every second one with a part that is not there."""
+    searches = count()
+    for row, (number, image, scene, is_known) in enumerate(_images(sources, network)):
+        for part in (image.part, image.stranger if row % 2 == 0 else None):
+            if part is not None:
+                yield Search(image, part, device_part(network, part), scene, next(searches), number, is_known)
+
+
+def _images(sources: Sources, network: Model) -> Iterator[tuple[int, TrueImage, Scene, bool]]:
+    """Yield all images with their scenes.
+
+    Also yield a number that those of one object share, or of one family of parts, and whether the network knows it.
+    """
+    folders = sorted(path for path in sources.bins.glob("*") if (path / SPLIT).is_dir())
+    if not folders:
+        raise InputError(f"{sources.bins} holds no datasets: python -m experiments.build_data validation-bins")
+    for number, folder in enumerate(folders, start=1):
+        for image in tqdm(bin_images(folder, SPLIT, network, sources.every), unit="image", desc=folder.name):
+            yield 1000 * number + image.key.scene_id, image, image.scene, False
+    for number, world in enumerate((sources.worlds, sources.known_worlds)):
+        if world is None:
+            continue
+        is_known = number == 1
+        for row, found in enumerate(tqdm(world_images(world, network), unit="image", desc=f"worlds {world.name}")):
+            with suppress(InputError):  # a scan without foreground, as of an empty table
+                scene = make_scene(as_given(found, row) if is_known else found.scan, found.part.diameter)
+                yield _KINDS * number + found.kind, found, scene, is_known
+
+
+def as_given(image: WorldImage, row: int) -> Scan:
+    """Return a scan as users may have it: as a depth image, as a cloud, or, if there are any, cut out around copies."""
+    if row % 3 == 0:
+        return image.scan
+    cut = None
+    if row % 3 == 2:
+        cut = image.cloud(np.random.default_rng(row).uniform(*_MARGINS))
+    return cut if cut is not None and len(cut.points) else image.cloud()
+
+
+def _proposed(search: Search, network: Model, config: SearchConfig, method: str) -> Candidates:
+    """Return the poses in crops around the seeds of a detection's first round."""
+    rows = seeds_over(search.scene, search.scene.foreground, search.image.part)
+    if method == "FPFH":
+        return fpfh_poses(search.part, search.on_device, search.scene, rows)
+    return search_at(network, search.on_device, search.scene, rows, 0, config)
+
+
+def _with_poses(found: Candidates) -> Candidates:
+    """Return the candidates of those crops that have any, or of the first: what the network says of crops is large."""
+    crops = np.unique(found.crop[found.usable]) if found.usable.any() else np.arange(1)
+    rows = np.isin(found.crop, crops)
+    return Candidates(
+        found.T_camera_object[rows],
+        found.usable[rows],
+        found.evidence[rows],
+        found.num_inliers[rows],
+        np.searchsorted(crops, found.crop[rows]),
+        jax.tree.map(lambda leaf: np.asarray(leaf)[crops], found.found),
+        found.seed_rows[crops],
+    )
+
+
+def _made_of(sources: Sources, fits: FitOptions, network: Model) -> str:
+    """Say what candidates are made of."""
+    folders = [str(folder) for folder in (sources.bins, sources.worlds, sources.known_worlds)]
+    settings = DetectConfig().search_of(network.config)
+    decisive = fits.folds, fits.members, fits.absent_weight, TREE_SETTINGS  # for what is reported
+    return repr((sources.method, folders, sources.every, decisive, model_digest(network), settings, _MARGINS))

@@ -1,0 +1,151 @@
+"""Models of which poses are right, fitted to poses of many objects, and how well they predict objects left out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from experiments.bins import THRESHOLD
+from experiments.reliability_picture import reliability_table
+from kmn_jax.detection import (
+    COMPANY,
+    EVIDENCE,
+    Calibration,
+    DetectConfig,
+    company,
+    expected_calibration_error,
+    fit_calibration,
+    fit_logistic,
+    vouched,
+)
+from kmn_jax.errors import InputError
+
+_SCALE_RIDGE = 1e-4  # hardly any: it makes probabilities too modest
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How models are fitted."""
+
+    folds: int = 5
+    members: int = 3  # fits, whose mean is the model of refined poses
+    absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
+
+
+def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return poses that are right if all of their points are."""
+    return poses | {"error": poses["largest_error"]}
+
+
+def held_out_models(
+    poses: dict[str, np.ndarray], options: FitOptions
+) -> Iterator[tuple[Int[np.ndarray, " o"], Calibration]]:
+    """Yield some objects, and the model that is fitted to the poses of all others, until each had its turn."""
+    for own in _folds(poses, options):
+        others = ~np.isin(poses["object"], own)
+        yield own, model_of({column: values[others] for column, values in poses.items()}, options)
+
+
+def _folds(poses: dict[str, np.ndarray], options: FitOptions) -> list[Int[np.ndarray, " o"]]:
+    """Return the objects of poses in groups, each of which has its turn as what is not fitted to."""
+    names = np.unique(poses["object"])
+    return [names[fold :: options.folds] for fold in range(min(options.folds, len(names)))]
+
+
+def model_of(poses: dict[str, np.ndarray], options: FitOptions) -> Calibration:
+    members = options.members if poses["refined"].all() else 1  # one is enough to choose what is refined
+    right, weights = poses["error"] < THRESHOLD, _weights(poses, options)
+    return fit_calibration(poses["evidence"], right, EVIDENCE, weights, members=members)
+
+
+def _weights(poses: dict[str, np.ndarray], options: FitOptions) -> Float[np.ndarray, " s"]:
+    """Return how much poses count: refined ones of absent parts more than others, and all less if an object has many.
+
+    What objects, or families of parts, have in common is to be learned, not what those few are like that have most.
+    """
+    absent = ~np.isfinite(poses["error"])
+    _, which, counts = np.unique(poses["object"], return_inverse=True, return_counts=True)
+    weights = np.where(absent & poses["refined"], options.absent_weight, 1.0) / np.sqrt(counts[which])
+    return weights * (len(weights) / max(weights.sum(), 1e-9))
+
+
+class Fitted(NamedTuple):
+    """A model, and how well models predict the objects that they were not fitted to."""
+
+    model: Calibration
+    held_out: Float[np.ndarray, " s"]  # log odds of the poses by models that do not know their object
+    results: dict[str, Any]
+
+
+def fit(poses: dict[str, np.ndarray], options: FitOptions) -> Fitted:
+    """Fit a model of evidence.
+
+    Where some poses are those that detection reports, the scale of the model is fitted to them, as models of other
+    objects predict them, and they are what is judged.
+    """
+    right = poses["error"] < THRESHOLD
+    held_out = np.zeros(len(right))
+    for names, others in held_out_models(poses, options):
+        own = np.isin(poses["object"], names)
+        held_out[own] = others.logit(poses["evidence"][own])
+    model = model_of(poses, options)
+    judged = np.ones_like(right)
+    if poses["reported"].any():
+        judged = poses["reported"]
+        scale = fit_logistic(held_out[judged, None], right[judged], ("logit",), _SCALE_RIDGE)
+        if scale.weights[0] <= 0:
+            raise InputError("poses are right no more often where models of other objects say so: give more bins")
+        model, held_out = model.scaled(scale.weights[0], scale.bias), scale.weights[0] * held_out + scale.bias
+    return Fitted(model, held_out, _judged({name: values[judged] for name, values in poses.items()}, held_out[judged]))
+
+
+def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: FitOptions) -> Fitted:
+    """Fit the model of what reported poses of one narrowed search say about each other, given the log odds of each.
+
+    What is judged are all reported poses, of which those of other searches, and those that are alone, keep their odds.
+    Raises InputError if no two poses are reported of one such search.
+    """
+    logits = logits[poses["reported"]]
+    poses = {name: values[poses["reported"]] for name, values in poses.items()}
+    right, columns, together = poses["error"] < THRESHOLD, np.zeros((len(logits), 2)), poses["narrowed"].copy()
+    for search in np.unique(poses["search"]):
+        rows = np.flatnonzero(poses["search"] == search)
+        columns[rows] = company(logits[rows])
+        together[rows] &= len(rows) > 1
+    if not together.any():
+        raise InputError("in no image of the bins are two poses reported: give more bins")
+
+    def of_company(rows: Bool[np.ndarray, " s"]) -> Calibration:
+        return fit_logistic(columns[rows], right[rows], COMPANY, _SCALE_RIDGE)
+
+    held_out = logits.copy()
+    for names in _folds(poses, options):
+        own = together & np.isin(poses["object"], names)
+        if own.any():
+            others = of_company(together & ~own)
+            for search in np.unique(poses["search"][own]):
+                rows = np.flatnonzero(poses["search"] == search)
+                held_out[rows] = vouched(logits[rows], others)
+    return Fitted(of_company(together), held_out, _judged(poses, held_out))
+
+
+def _judged(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"]) -> dict[str, Any]:
+    """Return how well log odds predict which poses are right."""
+    right, there = poses["error"] < THRESHOLD, np.isfinite(poses["error"])
+    probability = 1 / (1 + np.exp(-logits))
+    accepted = probability >= DetectConfig().accepted
+    present = accepted & there
+    summary = {
+        "objects": len(np.unique(poses["object"])),
+        "poses": len(right),
+        "right": float(right.mean()),
+        "expected calibration error": expected_calibration_error(probability, right),
+        "right among accepted": float(right[accepted].mean()) if accepted.any() else None,
+        "right among accepted where the part is": float(right[present].mean()) if present.any() else None,
+        "accepted among right": float(accepted[right].mean()),
+    }
+    return {"summary": summary, "reliability": reliability_table(probability, right)}
