@@ -21,6 +21,7 @@ from kmn_jax.detection import (
     DepthImage,
     DevicePart,
     bin_poses,
+    calibration_beside,
     device_calibration,
     load_probabilities,
     poses_in_crop,
@@ -136,7 +137,7 @@ def _bin(seeds: int) -> Program:
 
         number = _array((), jnp.float32)
         image = DepthImage(_array(_IMAGE, jnp.float32), Intrinsics(*[number] * 6))
-        stored = load_probabilities(released_file("small").with_suffix(".calibration.json"), EVIDENCE)
+        stored = load_probabilities(calibration_beside(released_file("small")), EVIDENCE)
         own = device_calibration(stored.found)
         calibration = CalibrationArrays(*(_array(leaf.shape, leaf.dtype) for leaf in own))
         inside, key = _array(_IMAGE, jnp.bool_), _array((2,), jnp.uint32)

@@ -25,13 +25,13 @@ import tyro
 from experiments.candidates import Sources, candidates
 from experiments.fits import FitOptions, by_largest_error, fit, fit_together
 from experiments.reliability_picture import save_reliability
-from kmn_jax.detection import Probabilities, load_lightgbm, probabilities_bytes
+from kmn_jax.detection import Probabilities, calibration_beside, load_lightgbm, probabilities_bytes
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
-from kmn_jax.models import load_model, load_pretrained
+from kmn_jax.models import load_model, load_pretrained, released_file
 from kmn_jax.report import check_target, print_table, write_json
 
-SHIPPED = Path(__file__).parent.parent / "kmn_jax" / "pretrained" / "small.calibration.json"
+SHIPPED = calibration_beside(released_file("small"))
 
 
 @dataclass(frozen=True)

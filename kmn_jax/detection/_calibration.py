@@ -180,6 +180,11 @@ def probabilities_bytes(probabilities: Probabilities) -> bytes:
     return (json.dumps(models) + "\n").encode()
 
 
+def calibration_beside(weights: str | Path) -> Path:
+    """Return where the probabilities that were fitted for a file of weights are kept."""
+    return Path(weights).with_suffix(".calibration.json")
+
+
 def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
     """Read models of the evidence with the given names. Raises InputError if the file holds anything else."""
     evidence = {field.name: COMPANY if field.name == "together" else tuple(names) for field in fields(Probabilities)}

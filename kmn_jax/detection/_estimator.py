@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from kmn_jax.bop import bop_object, bop_scan, bop_scene_id, is_bop_image
-from kmn_jax.detection._calibration import Probabilities, load_probabilities
+from kmn_jax.detection._calibration import Probabilities, calibration_beside, load_probabilities
 from kmn_jax.detection._coverage import unexplained
 from kmn_jax.detection._detect import DetectConfig, detect
 from kmn_jax.detection._evidence import EVIDENCE
@@ -85,11 +85,8 @@ class PoseEstimator:
         read_kept()
         path = Path(weights) if Path(weights).suffix == ".safetensors" else released_file(str(weights))
         model = load_model(path)
-        fitted = path.with_suffix(".calibration.json")
-        own = fitted.is_file()
-        probabilities = load_probabilities(
-            fitted if own else released_file("small").with_suffix(".calibration.json"), EVIDENCE
-        )
+        own = calibration_beside(path).is_file()
+        probabilities = load_probabilities(calibration_beside(path if own else released_file("small")), EVIDENCE)
         warnings = () if own else (_UNFITTED,)
         return cls(model, model_digest(model), probabilities, config or DetectConfig(), warnings, str(weights))
 

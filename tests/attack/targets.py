@@ -14,7 +14,7 @@ from experiments.evaluation.clouds import read_poses
 from experiments.evaluation.predictions import Export
 from kmn_jax.bop import BopDataset, bop_scan, bop_sizes
 from kmn_jax.data import Pack
-from kmn_jax.detection._calibration import load_probabilities
+from kmn_jax.detection._calibration import calibration_beside, load_probabilities
 from kmn_jax.detection._evidence import EVIDENCE
 from kmn_jax.errors import InputError
 from kmn_jax.io import read_mesh, read_pose, read_scan
@@ -144,7 +144,7 @@ def _card(folder: Path, path: Path) -> Any:
 
 def _calibration(path: Path) -> None:
     """Write the released probabilities with few trees: damage strikes what is around them, too."""
-    models = json.loads(released_file("small").with_suffix(".calibration.json").read_bytes())
+    models = json.loads(calibration_beside(released_file("small")).read_bytes())
     for model in models.values():
         model |= {name: model[name][:3] for name in ("columns", "thresholds", "values")}
     path.write_text(json.dumps(models))
