@@ -18,27 +18,28 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
-from experiments.candidates import Sources, candidates
+from experiments.candidates import Sources, poses_to_fit
 from experiments.fits import FitOptions, by_largest_error, fit, fit_together
 from experiments.reliability_picture import save_reliability
 from kmn_jax.detection import Probabilities, calibration_beside, load_lightgbm, probabilities_bytes
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
-from kmn_jax.models import load_model, load_pretrained, released_file
+from kmn_jax.models import PRETRAINED, load_model, load_pretrained
 from kmn_jax.report import check_target, print_table, write_json
 
-SHIPPED = calibration_beside(released_file("small"))
+SHIPPED = calibration_beside(PRETRAINED / "small.safetensors")
 
 
 @dataclass(frozen=True)
 class Options(FitOptions, Sources):
     """What to fit, on what, and where to write it."""
 
-    output: Path = SHIPPED  # the calibration
+    model: Annotated[Path | None, tyro.conf.Positional] = None  # .safetensors; the released model unless given
+    output: Path | None = None  # the calibration; beside the model unless given
     candidates: Path | None = None  # .npz file to keep the poses in, which need not be searched again then
     json: Path | None = None
     picture: Path | None = None  # .png file for the reliability diagram
@@ -46,11 +47,14 @@ class Options(FitOptions, Sources):
 
 def calibrate(options: Options) -> dict[str, Any]:
     """Fit, write and print. Raises InputError if there is nothing to fit to."""
-    for target in (options.json, options.picture):
+    if options.method != "kmn_jax" and options.output is None:
+        raise InputError("say where the probabilities of another method shall go: --output FILE")
+    output = options.output or (SHIPPED if options.model is None else calibration_beside(options.model))
+    for target in (output, options.candidates, options.json, options.picture):
         check_target(target)
     load_lightgbm()  # before an hour of searching, not after
     network = load_pretrained() if options.model is None else load_model(options.model)
-    poses = candidates(options.candidates, options, options, network)
+    poses = poses_to_fit(options, options, network, options.candidates)
     refined = {column: values[poses["refined"]] for column, values in poses.items()}
     found = {column: values[~poses["refined"]] for column, values in poses.items()}
     fitted = {
@@ -63,7 +67,7 @@ def calibrate(options: Options) -> dict[str, Any]:
         print_table(f"Reliability of poses as {name}, of objects that were not fitted to", result["reliability"])
         print_table(f"Poses as {name}", [result["summary"]])
     probabilities = Probabilities(**{name: one.model for name, one in fitted.items()})
-    write_whole(options.output, probabilities_bytes(probabilities))
+    write_whole(output, probabilities_bytes(probabilities))
     write_json(options.json, results)
     save_reliability({f"poses as {name}": found["reliability"] for name, found in results.items()}, options.picture)
     return results

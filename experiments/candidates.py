@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from io import BytesIO
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast
+from zipfile import BadZipFile
 
 import jax
 import numpy as np
-import tyro
 from jaxtyping import Float32
 from tqdm import tqdm
 
@@ -21,7 +22,7 @@ from experiments.fpfh import fpfh_poses
 from experiments.test_sets import SPLIT
 from kmn_jax.detection import (
     EVIDENCE,
-    OF_PICTURE,
+    PICTURE_EVIDENCE,
     TREE_SETTINGS,
     Candidates,
     DetectConfig,
@@ -36,7 +37,8 @@ from kmn_jax.detection import (
     search_at,
     seeds_over,
 )
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, shown
+from kmn_jax.files import write_whole
 from kmn_jax.io import Scan
 from kmn_jax.models import Model
 from kmn_jax.objects import Part, model_digest
@@ -59,14 +61,14 @@ _KINDS = 100  # more than the families of parts in a folder of world bins
 
 @dataclass(frozen=True)
 class Sources:
-    """What is searched, with what, and in which images."""
+    """How and in which images is searched."""
 
-    model: Annotated[Path | None, tyro.conf.Positional] = None  # .safetensors; the released model unless given
     method: Literal["kmn_jax", "FPFH"] = "kmn_jax"
     bins: Path = Path("outputs/validation_bins")  # folder with datasets in BOP format
     worlds: Path | None = None  # folder of world bins to fit on, too: outputs/worlds/validation
     known_worlds: Path | None = None  # the same, of parts that the network was trained with: no scale is fitted to it
     every: int = 1  # use every so many images of `bins`
+    judge_anew: bool = False  # compute what depth images show of stored poses again, as after a change of that code
 
 
 class Search(NamedTuple):
@@ -107,29 +109,48 @@ class _Searched(NamedTuple):
     is_known: bool
 
 
-def candidates(stored: Path | None, sources: Sources, fits: FitOptions, network: Model) -> dict[str, np.ndarray]:
+def poses_to_fit(
+    sources: Sources, fits: FitOptions, network: Model, stored: Path | None = None
+) -> dict[str, np.ndarray]:
     """Return evidence, outcome, object and search of all poses, and whether they are refined, and what is judged.
 
-    What is `stored` is not searched again, and written there if it was not. If it holds other kinds of evidence, its
-    poses are judged anew: of them, what was refined was chosen by the evidence of before. Raises InputError if what is
-    stored is of other bins, weights or settings.
+    What is `stored` is not searched again; what is searched is written there. Where what depth images show is wanted
+    anew, or other kinds of it, stored poses are judged anew, and stored with that: those that are refined stay the ones
+    that were chosen by the evidence of before, and evidence that is not used any more is kept. Raises InputError if
+    what is stored is of other bins, weights or settings, or lacks evidence that comes of crops.
     """
-    made_of = _made_of(sources, fits, network)
+    made_of, names = _made_of(sources, fits, network), list(EVIDENCE)
     if stored is None or not stored.exists():
         poses = collect(sources, fits, network)
     else:
+        poses = _read(stored, made_of)
+        names = poses.pop("names").tolist()
+        lacking = sorted(set(EVIDENCE) - {*names, *PICTURE_EVIDENCE})
+        if lacking:
+            raise InputError(f"{stored} lacks {', '.join(lacking)}, which comes of crops: remove it, to search again")
+        if set(EVIDENCE) <= set(names) and not sources.judge_anew:
+            return poses | {"evidence": poses["evidence"][:, [names.index(name) for name in EVIDENCE]]}
+        unused = [column for column, name in enumerate(names) if name not in EVIDENCE]
+        kept = poses["evidence"][:, unused]
+        poses = judged_anew(poses, names, sources, fits, network)
+        poses["evidence"] = np.concatenate([poses["evidence"], kept], axis=1)
+        names = [*EVIDENCE, *(names[column] for column in unused)]
+    if stored is not None:
+        written, arrays = BytesIO(), poses | {"names": np.array(names), "made_of": np.array(made_of)}
+        np.savez(written, **cast(dict[str, Any], arrays))
+        write_whole(stored, written.getvalue())
+    return poses | {"evidence": poses["evidence"][:, : len(EVIDENCE)]}
+
+
+def _read(stored: Path, made_of: str) -> dict[str, np.ndarray]:
+    """Return what is stored. Raises InputError if it is something else."""
+    try:
         with np.load(stored) as file:
             poses = dict(file)
-        if str(poses.pop("made_of", "")) != made_of or set(poses) != {*_COLUMNS, "names"}:
-            raise InputError(f"{stored} holds poses of other bins, weights or settings: remove it")
-        names = tuple(poses.pop("names").tolist())
-        if names == EVIDENCE:
-            return poses
-        poses = judged_anew(poses, names, sources, fits, network)
-    if stored is not None:
-        whole = stored.with_suffix(".part.npz")
-        np.savez(whole, allow_pickle=False, made_of=np.array(made_of), names=np.array(EVIDENCE), **poses)
-        whole.replace(stored)
+    except (OSError, ValueError, TypeError, BadZipFile) as error:
+        raise InputError(f"{stored} holds no poses ({shown(error)}): remove it") from None
+    if str(poses.pop("made_of", "")) != made_of or set(poses) != {*_COLUMNS, "names"}:
+        raise InputError(f"{stored} holds poses of other bins, weights or settings: remove it")
     return poses
 
 
@@ -149,8 +170,8 @@ def collect(sources: Sources, fits: FitOptions, network: Model) -> dict[str, np.
     for search, found in zip(_searches(sources, network), proposed, strict=True):
         choice = chosen(found, chooser, search.on_device, _LOOSE)
         rows = np.flatnonzero(choice.kept | choice.contenders)
-        searched[search.row] = _Searched(search.on_device, search.is_known)
         if len(rows):
+            searched[search.row] = _Searched(search.on_device, search.is_known)
             parts.append(search.columns(refined_candidates(search.on_device, search.scene, found, rows, 0, config)))
     fine = _joined(parts)
     none = np.zeros(len(fine["error"]), dtype=bool)
@@ -158,28 +179,33 @@ def collect(sources: Sources, fits: FitOptions, network: Model) -> dict[str, np.
 
 
 def judged_anew(
-    poses: dict[str, np.ndarray], names: tuple[str, ...], sources: Sources, fits: FitOptions, network: Model
+    poses: dict[str, np.ndarray], names: list[str], sources: Sources, fits: FitOptions, network: Model
 ) -> dict[str, np.ndarray]:
-    """Return poses with evidence of today: what comes of pictures is computed, what comes of crops is that of `names`.
+    """Return poses with the evidence of today: what comes of crops is what they have, by `names`, the rest computed.
 
-    Raises InputError if evidence that comes of crops is not among the names.
+    Raises InputError if the images are not those that the poses were found in.
     """
-    if not set(EVIDENCE) <= {*names, *OF_PICTURE}:
-        raise InputError("the stored poses lack evidence that comes of crops: remove the file, to search them again")
-    old, searched = poses["evidence"], {}
-    evidence = np.zeros((len(old), len(EVIDENCE)), dtype=np.float32)
-    of_picture = np.array([EVIDENCE.index(name) for name in OF_PICTURE])
+    evidence = np.zeros((len(poses["evidence"]), len(EVIDENCE)), dtype=np.float32)
     for column, name in enumerate(EVIDENCE):
-        if name not in OF_PICTURE:
-            evidence[:, column] = old[:, names.index(name)]
-    config = DetectConfig().search_of(network.config)
+        if name not in PICTURE_EVIDENCE:
+            evidence[:, column] = poses["evidence"][:, names.index(name)]
+    of_picture = np.array([EVIDENCE.index(name) for name in PICTURE_EVIDENCE])
+    config, searched = DetectConfig().search_of(network.config), {}
     for search in _searches(sources, network):
-        searched[search.row] = _Searched(search.on_device, search.is_known)
         rows = np.flatnonzero(poses["search"] == search.row)
         if len(rows):
-            seen = picture_evidence(poses["T_camera_object"][rows], search.on_device, search.scene, config.agreement)
+            searched[search.row] = _Searched(search.on_device, search.is_known)
+            _check(bool((poses["object"][rows] == search.number).all()))
+            found = poses["T_camera_object"][rows]
+            seen = picture_evidence(found, search.on_device, search.scene, config.agreement)
             evidence[np.ix_(rows, of_picture)] = seen
+    _check(set(poses["search"].tolist()) == set(searched))
     return _with_reported(poses | {"evidence": evidence}, searched, fits)
+
+
+def _check(is_same: bool) -> None:
+    if not is_same:
+        raise InputError("the bins are not those that the stored poses were found in: remove the file")
 
 
 def _with_reported(

@@ -57,6 +57,7 @@ def _folds(poses: dict[str, np.ndarray], options: FitOptions) -> list[Int[np.nda
 
 
 def model_of(poses: dict[str, np.ndarray], options: FitOptions) -> Calibration:
+    """Return the model that is fitted to poses, of one member if any of them is as it was found."""
     members = options.members if poses["refined"].all() else 1  # one is enough to choose what is refined
     right, weights = poses["error"] < THRESHOLD, _weights(poses, options)
     return fit_calibration(poses["evidence"], right, EVIDENCE, weights, members=members)

@@ -23,11 +23,10 @@ from configs import CONFIGS
 from experiments.evaluation.plots import as_png, new_figure
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
-from kmn_jax.models import load_model
+from kmn_jax.models import PRETRAINED, load_model
 from kmn_jax.report import check_target, markdown_table
 from kmn_jax.train import read_metrics
 
-FOLDER = Path(__file__).parent.parent / "kmn_jax" / "pretrained"
 LIMIT = 10_000_000  # bytes of a released file
 _COLUMNS = ("step", "samples", "seconds", "split", "loss", "segmentation_accuracy", "keypoint_accuracy")
 _ALL = "all"  # what detect_worlds calls the row of all families
@@ -48,7 +47,7 @@ class Options:
     run: tyro.conf.Positional[Path]  # folder of the run
     evaluation: tyro.conf.Positional[Path]  # what `python -m experiments.evaluate_network RUN --json` wrote
     name: str | None = None  # of the released model; the run's unless given
-    folder: Path = FOLDER
+    folder: Path = PRETRAINED
     detection: tuple[Path, ...] = ()  # what detect_bins and detect_worlds wrote by --json, of the same weights
 
 

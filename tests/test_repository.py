@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import tomllib
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -101,6 +102,8 @@ def test_flags_of_xla_that_are_given_stay(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=3 --xla_dump_to=folder")
     flags = quick_flags().split()
     assert flags[:2] == ["--xla_backend_optimization_level=3", "--xla_dump_to=folder"]
-    assert len({flag.partition("=")[0] for flag in flags}) == len(flags)
+    assert (
+        len({flag.partition("=")[0] for flag in flags}) == len(flags) == (4 if version("jaxlib")[:5] == "0.10." else 2)
+    )
     monkeypatch.setenv("XLA_FLAGS", quick_flags())
     assert quick_flags().split() == flags

@@ -57,7 +57,7 @@ from kmn_jax.detection._detect import (
 )
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place, symmetry_transforms
 from kmn_jax.detection._estimator import PoseEstimator
-from kmn_jax.detection._evidence import EVIDENCE, OF_PICTURE, gather_evidence, picture_evidence
+from kmn_jax.detection._evidence import EVIDENCE, PICTURE_EVIDENCE, gather_evidence
 from kmn_jax.detection._export import export_estimator
 from kmn_jax.detection._fitting import TREE_SETTINGS, fit_calibration, fit_logistic, load_lightgbm
 from kmn_jax.detection._foreground import ForegroundOptions, OrientedBox, foreground
@@ -75,6 +75,7 @@ from kmn_jax.detection._search import (
     candidates_of,
     join,
     network_prediction,
+    picture_evidence,
     poses_at,
     search_at,
     seed_crop,
@@ -91,7 +92,7 @@ __all__ = [
     "FAST",
     "MOST_POINTS",
     "NUM_SEEDS",
-    "OF_PICTURE",
+    "PICTURE_EVIDENCE",
     "THOROUGH",
     "TREE_SETTINGS",
     "BinMargins",

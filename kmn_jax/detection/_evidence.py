@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Float32
+from jaxtyping import Array, Bool, Float
 
 from kmn_jax.detection._crop_search import CropPoses, Prediction
 from kmn_jax.detection._depth_agreement import DepthAgreement, DepthAgreementConfig, DepthImage, depth_agreement
-from kmn_jax.detection._device_part import DevicePart
-from kmn_jax.detection._mapping import call_rows, map_real
+from kmn_jax.detection._mapping import map_real
 from kmn_jax.detection._picture_agreement import PictureAgreement, picture_agreement
-from kmn_jax.detection._scene import Scene
 from kmn_jax.geometry import inverse, nearest, transform_points
 from kmn_jax.objects import PartArrays
 from kmn_jax.pose import PoseResult
@@ -33,8 +30,8 @@ _OF_CROP = (
     "certainty",  # mean probability of the likeliest keypoint
     "object_share",  # of the crop's points that are on the object
 )
-OF_PICTURE = (*DepthAgreement._fields, *PictureAgreement._fields)
-EVIDENCE = (*OF_PICTURE, *_OF_CROP)
+PICTURE_EVIDENCE = (*DepthAgreement._fields, *PictureAgreement._fields)
+EVIDENCE = (*PICTURE_EVIDENCE, *_OF_CROP)
 _NEAR = 0.1  # diameters
 _SURFACE = 0.05  # diameters; points so near to a surface with a normal like it lie on it
 _ALIKE = 0.5  # cosine
@@ -96,27 +93,18 @@ def _of_picture(
     return depth_agreement(pose, surfels, image, diameter, config)._asdict() | picture._asdict()
 
 
-def picture_evidence(
-    T_camera_object: Float32[np.ndarray, "s 4 4"], part: DevicePart, scene: Scene, config: DepthAgreementConfig
-) -> Float32[np.ndarray, "s f"]:
-    """Return what the depth image shows of poses that were found before, in the order of OF_PICTURE."""
-    given = part.surfels, scene.image, part.arrays.diameter, config
-    return call_rows(lambda pose: _one(pose, *given), lambda poses: _many(poses, *given), T_camera_object)
-
-
 def _mean(values: Array, where: Bool[Array, " n"]) -> Scalar:
     """Return the mean over some rows, zero of none."""
     chosen = jnp.where(where, values.astype(jnp.float32), 0)
     return chosen.sum() / jnp.maximum(where.sum(dtype=jnp.int32), 1).astype(jnp.float32)
 
 
-def _picture_row(
-    pose: Pose, surfels: Surfels, image: DepthImage, diameter: Scalar, config: DepthAgreementConfig
+def picture_columns(
+    T_camera_object: Pose, surfels: Surfels, image: DepthImage, diameter: Scalar, config: DepthAgreementConfig
 ) -> Float[Array, " f"]:
-    columns = _of_picture(pose, surfels, image, diameter, config)
-    return jnp.stack([columns[name] for name in OF_PICTURE])
+    """Return what the depth image shows of a pose, in the order of PICTURE_EVIDENCE."""
+    columns = _of_picture(T_camera_object, surfels, image, diameter, config)
+    return jnp.stack([columns[name] for name in PICTURE_EVIDENCE])
 
 
 gather_evidence = kept("config")(evidence_on)
-_one = jax.jit(_picture_row, static_argnames="config")
-_many = jax.jit(jax.vmap(_picture_row, in_axes=(0, None, None, None, None)), static_argnums=4)

@@ -20,7 +20,7 @@ from kmn_jax.detection._crop_search import (
 )
 from kmn_jax.detection._depth_agreement import DepthAgreementConfig, DepthImage
 from kmn_jax.detection._device_part import DevicePart
-from kmn_jax.detection._evidence import gather_evidence
+from kmn_jax.detection._evidence import PICTURE_EVIDENCE, gather_evidence, picture_columns
 from kmn_jax.detection._mapping import call_rows
 from kmn_jax.detection._result import CropPrediction
 from kmn_jax.detection._scene import Scene
@@ -137,6 +137,16 @@ def _seed_key(row: int, random_seed: int) -> PRNGKey:
     return jax.random.wrap_key_data(seed_keys(np.array([row]), random_seed)[0])
 
 
+def picture_evidence(
+    T_camera_object: Float32[np.ndarray, "s 4 4"], part: DevicePart, scene: Scene, config: DepthAgreementConfig
+) -> Float32[np.ndarray, "s f"]:
+    """Return what the depth image shows of poses that were found before, in the order of PICTURE_EVIDENCE."""
+    if not len(T_camera_object):
+        return np.zeros((0, len(PICTURE_EVIDENCE)), dtype=np.float32)
+    given = part.surfels, scene.image, part.arrays.diameter, config
+    return call_rows(lambda pose: _columns(pose, *given), lambda poses: _columns_of(poses, *given), T_camera_object)
+
+
 def candidates_of(found: CropPoses, evidence: Float[np.ndarray, "c h f"], rows: Int[np.ndarray, " c"]) -> Candidates:
     """Return what was found in crops as candidates."""
     count, modes = found.poses.converged.shape
@@ -214,3 +224,7 @@ def _search_many(
 @jax.jit
 def _keys(key: PRNGKey, rows: Int[Array, " c"]) -> UInt32[Array, "c 2"]:
     return jax.random.key_data(jax.vmap(lambda row: jax.random.fold_in(key, row))(rows))
+
+
+_columns = jax.jit(picture_columns, static_argnames="config")
+_columns_of = jax.jit(jax.vmap(picture_columns, in_axes=(0, None, None, None, None)), static_argnums=4)

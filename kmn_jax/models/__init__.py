@@ -17,12 +17,13 @@ from kmn_jax.models._layers import Compute
 from kmn_jax.models._losses import LossConfig, MatchingLoss, keypoint_labels, matching_loss
 from kmn_jax.models._normalization import released_object, released_scene
 from kmn_jax.models._released import RELEASED_CONFIG, load_released, save_released
-from kmn_jax.models._weights import is_model_file, load_model, load_pretrained, released_file, save_model
+from kmn_jax.models._weights import PRETRAINED, is_model_file, load_model, load_pretrained, released_file, save_model
 
 __all__ = [
     "LATER_PAIR_CHANNELS",
     "OBJECT_CHANNELS",
     "PAIR_CHANNELS",
+    "PRETRAINED",
     "RELEASED_CONFIG",
     "SCENE_CHANNELS",
     "Compute",

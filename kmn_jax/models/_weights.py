@@ -17,6 +17,7 @@ from kmn_jax.limits import parse_json
 from kmn_jax.models._config import KeyMatchNetConfig
 from kmn_jax.models._keymatchnet import Model, model_structure
 
+PRETRAINED = Path(__file__).parent.parent / "pretrained"  # released models, and what belongs to them
 _CONFIG_KEY = "kmn_jax.config"
 
 
@@ -43,10 +44,9 @@ def released_file(name: str) -> Path:
 
     Raises InputError if there is none of that name.
     """
-    folder = Path(__file__).parent.parent / "pretrained"
-    path = folder / f"{name}.safetensors"
+    path = PRETRAINED / f"{name}.safetensors"
     if not path.is_file():
-        names = ", ".join(sorted(file.stem for file in folder.glob("*.safetensors"))) or "none"
+        names = ", ".join(sorted(file.stem for file in PRETRAINED.glob("*.safetensors"))) or "none"
         raise InputError(f"there is no released model {name!r}: there are {names}")
     return path
 

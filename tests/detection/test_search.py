@@ -11,7 +11,7 @@ import pytest
 
 from kmn_jax.detection import (
     EVIDENCE,
-    OF_PICTURE,
+    PICTURE_EVIDENCE,
     Candidates,
     CropPoses,
     CropSearchConfig,
@@ -24,7 +24,7 @@ from kmn_jax.detection import (
     search_at,
     spread_seeds,
 )
-from kmn_jax.detection._search import no_poses
+from kmn_jax.detection._search import _columns_of, no_poses
 from kmn_jax.geometry import PaddedCloud, spread_rows
 from kmn_jax.io import Scan
 from kmn_jax.models import Model, create_model, encode_object
@@ -174,11 +174,13 @@ def test_the_picture_shows_the_same_of_poses_that_were_kept(part: DevicePart, sc
     poses[:, 2, 3] = [13, 14, 30]  # the box begins 7.5 nearer, what was measured lies at 6
     seen = picture_evidence(poses, part, scene, CONFIG.agreement)
     none = no_poses(CROPS, NETWORK.num_keypoints)
-    there = np.ones(CROPS.num_poses, dtype=bool)
+    there, columns = np.ones(CROPS.num_poses, dtype=bool), [EVIDENCE.index(name) for name in PICTURE_EVIDENCE]
     for pose, row in zip(poses, seen, strict=True):
         found = none._replace(
             poses=none.poses._replace(T_scene_object=np.tile(pose, (len(there), 1, 1)), converged=there)
         )
         wanted = gather_evidence(found, part.arrays, part.surfels, scene.image, CONFIG.agreement)[0]
-        np.testing.assert_allclose(row, wanted[np.array([EVIDENCE.index(name) for name in OF_PICTURE])], atol=1e-5)
+        np.testing.assert_allclose(row, wanted[np.array(columns)], atol=1e-5)
     assert np.ptp(seen, axis=0).max() > 0.1
+    assert picture_evidence(poses[:0], part, scene, CONFIG.agreement).shape == (0, len(columns))
+    np.testing.assert_allclose(_columns_of(poses, part.surfels, scene.image, 2.0, CONFIG.agreement), seen, atol=1e-5)

@@ -7,15 +7,28 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from experiments import candidates as module
-from experiments.candidates import Sources, candidates, judged_anew
+from experiments.calibrate import Options, calibrate
+from experiments.candidates import Sources, poses_to_fit
 from experiments.fits import FitOptions
-from kmn_jax.detection import EVIDENCE, OF_PICTURE, Candidates
+from kmn_jax.detection import (
+    EVIDENCE,
+    PICTURE_EVIDENCE,
+    Calibration,
+    Candidates,
+    DetectConfig,
+    DevicePart,
+    chosen,
+)
 from kmn_jax.errors import InputError
-from kmn_jax.models import create_model
+from kmn_jax.models import Model, create_model, load_pretrained
+from kmn_jax.objects import PartArrays
+from kmn_jax.simulate import Surfels
+from tests.reference.clouds import box_cloud
 from tests.reference.networks import TINY
 
 
@@ -38,34 +51,50 @@ def test_crops_without_poses_are_dropped_and_the_others_keep_theirs() -> None:
 
 @pytest.fixture
 def searched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let two searches be made again, whose poses show as much to the camera as they are shifted."""
+    """Let two searches be made again, whose pictures tell search, pose and kind of evidence apart.
+
+    Models are named by how many poses they take for right: what chooses is to be the one of ADI, and the exact one that
+    of MSSD.
+    """
 
     def searches(sources: Sources, network: Any) -> Any:
         for row in range(2):
-            yield SimpleNamespace(row=row, on_device=row, scene=row, is_known=row == 1)
+            yield SimpleNamespace(row=row, on_device=row, scene=row, is_known=row == 1, number=7 + row)
 
-    def shown(poses: np.ndarray, part: int, scene: int, config: Any) -> np.ndarray:
-        return np.repeat(poses[:, :1, 3] + 10 * scene, len(OF_PICTURE), axis=1)
+    def shown(poses: np.ndarray, part: int, scene: int, agreement: Any) -> np.ndarray:
+        assert agreement == DetectConfig().search.agreement
+        return poses[:, :1, 3] + 10 * scene + 100 * np.arange(len(PICTURE_EVIDENCE))
+
+    def models(poses: dict[str, np.ndarray], fits: FitOptions) -> Any:
+        assert poses["refined"].all()
+        return [(np.unique(poses["object"]), int((poses["error"] < 0.1).sum()))]
+
+    def all_but_the_first(found: Candidates, model: int, part: Any, config: Any, exact: int) -> Any:
+        assert (model, exact) == (5, 2)
+        assert found.evidence.shape[1] == len(EVIDENCE)
+        return SimpleNamespace(kept=np.arange(len(found.usable)) > 0)
 
     monkeypatch.setattr(module, "_searches", searches)
     monkeypatch.setattr(module, "picture_evidence", shown)
-    monkeypatch.setattr(module, "held_out_models", lambda poses, fits: [(np.unique(poses["object"]), "model")])
-    monkeypatch.setattr(module, "_made_of", lambda *given: "these")
-
-    def all_but_the_first(found: Candidates, *given: Any) -> Any:
-        return SimpleNamespace(kept=np.arange(len(found.usable)) > 0)
-
+    monkeypatch.setattr(module, "held_out_models", models)
     monkeypatch.setattr(module, "chosen", all_but_the_first)
 
 
-def stored_poses(names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Return four poses of one search and two of another: of the first a found one and three refined ones."""
+@pytest.fixture(scope="module")
+def network() -> Model:
+    return create_model(TINY, jax.random.key(0))
+
+
+def store(path: Path, network: Model, names: tuple[str, ...] = EVIDENCE, **others: Any) -> None:
+    """Write four poses of one search and two of another: of the first a found one and three refined ones."""
     poses = np.tile(np.eye(4, dtype=np.float32), (6, 1, 1))
     poses[:, 0, 3] = np.arange(6)
-    return {
+    stored = {
+        "made_of": np.array(module._made_of(Sources(), FitOptions(), network)),
+        "names": np.array(names),
         "evidence": np.tile(np.arange(len(names), dtype=np.float32), (6, 1)),
         "error": np.full(6, 0.01),
-        "largest_error": np.full(6, 0.01),
+        "largest_error": np.array([0.01, 0.2, 0.2, 0.2, 0.01, 0.01]),
         "object": np.array([7, 7, 7, 7, 8, 8]),
         "search": np.array([0, 0, 0, 0, 1, 1]),
         "narrowed": np.zeros(6, dtype=bool),
@@ -73,42 +102,99 @@ def stored_poses(names: tuple[str, ...]) -> dict[str, np.ndarray]:
         "refined": np.array([False, True, True, True, True, True]),
         "reported": np.zeros(6, dtype=bool),
     }
+    np.savez(path, **stored | others)
 
 
-_OF_CROPS = tuple(name for name in EVIDENCE if name not in OF_PICTURE)
+_OF_CROPS = tuple(name for name in EVIDENCE if name not in PICTURE_EVIDENCE)
 
 
 @pytest.mark.usefixtures("searched")
-def test_stored_poses_are_judged_anew_by_other_evidence(tmp_path: Path) -> None:
+def test_stored_poses_are_judged_anew_by_other_evidence(
+    tmp_path: Path, network: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, names = tmp_path / "poses.npz", ("what is gone", *reversed(_OF_CROPS))
-    np.savez(path, allow_pickle=False, made_of=np.array("these"), names=np.array(names), **stored_poses(names))
-    network: Any = SimpleNamespace(config=create_model(TINY, jax.random.key(0)).config)
-    poses = candidates(path, Sources(), FitOptions(), network)
+    store(path, network, names)
+    poses = poses_to_fit(Sources(), FitOptions(), network, path)
     for name in EVIDENCE:
         column = poses["evidence"][:, EVIDENCE.index(name)]
-        wanted = [0, 1, 2, 3, 14, 15] if name in OF_PICTURE else np.full(6, names.index(name))
+        if name in PICTURE_EVIDENCE:
+            wanted = np.array([0, 1, 2, 3, 14, 15]) + 100 * PICTURE_EVIDENCE.index(name)
+        else:
+            wanted = np.full(6, names.index(name))
         np.testing.assert_array_equal(column, wanted)
     # Of refined poses, those that are chosen; none of parts that the network knows.
     np.testing.assert_array_equal(poses["reported"], [False, False, True, True, False, False])
-    again = candidates(path, Sources(), FitOptions(), network)
+    with np.load(path) as stored:  # nothing is lost that another day's evidence may want
+        assert set(stored["names"].tolist()) == {*EVIDENCE, "what is gone"}
+        gone = stored["names"].tolist().index("what is gone")
+        np.testing.assert_array_equal(stored["evidence"][:, gone], 0)
+    assert sorted(tmp_path.iterdir()) == [path]
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_searches", None)  # not once more
+        again = poses_to_fit(Sources(), FitOptions(), network, path)
     assert again.keys() == poses.keys()
     for name, values in poses.items():
         np.testing.assert_array_equal(again[name], values)
-    assert sorted(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.usefixtures("searched")
-def test_poses_that_lack_what_comes_of_crops_cannot_be_judged() -> None:
-    names = _OF_CROPS[1:]
-    with pytest.raises(InputError, match="remove the file"):
-        judged_anew(stored_poses(names), names, Sources(), FitOptions(), SimpleNamespace(config=TINY))  # type: ignore
-
-
-@pytest.mark.usefixtures("searched")
-def test_candidates_of_other_bins_are_refused(tmp_path: Path) -> None:
+def test_stored_poses_are_judged_anew_if_that_is_asked_for(tmp_path: Path, network: Model) -> None:
     path = tmp_path / "poses.npz"
+    store(path, network)
+    assert poses_to_fit(Sources(), FitOptions(), network, path)["evidence"][5, 0] == 0
+    assert poses_to_fit(Sources(judge_anew=True), FitOptions(), network, path)["evidence"][5, 0] == 15
+
+
+@pytest.mark.usefixtures("searched")
+def test_stored_poses_that_cannot_be_judged_anew_stay(tmp_path: Path, network: Model) -> None:
+    path, anew = tmp_path / "poses.npz", Sources(judge_anew=True)
+    store(path, network, EVIDENCE[:-1])
+    before = path.read_bytes()
+    with pytest.raises(InputError, match=f"lacks {EVIDENCE[-1]}, which comes of crops"):
+        poses_to_fit(Sources(), FitOptions(), network, path)
+    assert path.read_bytes() == before
+    for wrong in ({"object": np.full(6, 7)}, {"search": np.array([0, 0, 0, 0, 1, 2])}):
+        store(path, network, **wrong)
+        with pytest.raises(InputError, match="not those that the stored poses were found in"):
+            poses_to_fit(anew, FitOptions(), network, path)
+
+
+def test_poses_of_other_bins_are_refused(tmp_path: Path) -> None:
+    path, output = tmp_path / "poses.npz", tmp_path / "a.json"
     for wrong in ({"made_of": np.array("others")}, {"more": np.zeros(1)}):
-        stored = {"made_of": np.array("these"), "names": np.array(EVIDENCE), **stored_poses(EVIDENCE)} | wrong
-        np.savez(path, allow_pickle=False, **stored)
+        store(path, load_pretrained(), **wrong)
         with pytest.raises(InputError, match="holds poses of other bins, weights or settings: remove it"):
-            candidates(path, Sources(), FitOptions(), SimpleNamespace())  # type: ignore
+            calibrate(Options(candidates=path, output=output))
+    path.write_bytes(b"no numbers")
+    with pytest.raises(InputError, match="holds no poses"):
+        calibrate(Options(candidates=path, output=output))
+    assert not output.exists()
+
+
+def test_another_method_does_not_replace_what_is_shipped() -> None:
+    with pytest.raises(InputError, match="--output"):
+        calibrate(Options(method="FPFH"))
+
+
+def test_poses_are_chosen_among_as_those_of_a_search(motor: DevicePart) -> None:
+    poses = np.tile(np.eye(4, dtype=np.float32), (8, 1, 1))
+    poses[:, 0, 3] = [0, 0.1, 5, 5, 10, 10, 0, 5.1]
+    usable = np.array([True, True, False, True, True, False, True, True])
+    evidence = np.random.default_rng(0).normal(size=(8, len(EVIDENCE))).astype(np.float32)
+    none: Any = np.zeros(8, dtype=np.int32)
+    found = Candidates(poses, usable, evidence, none, none, none, none)
+    weights = tuple(float(name == "near") for name in EVIDENCE)
+    model = Calibration(EVIDENCE, weights, 0.0)
+    whole = chosen(found, model, motor, DetectConfig(reported=0.0)).kept
+    few = chosen(module._choosable(poses[usable], evidence[usable]), model, motor, DetectConfig(reported=0.0)).kept
+    np.testing.assert_array_equal(few, whole[usable])
+    assert 0 < few.sum() < len(few)
+
+
+@pytest.fixture
+def motor() -> DevicePart:
+    cloud = box_cloud(0, 128, (1.0, 0.6, 0.4))
+    points, normals = jnp.asarray(cloud[:, :3]), jnp.asarray(cloud[:, 3:])
+    arrays = PartArrays(points, normals, jnp.zeros((128, 1)), jnp.float32(1.2))
+    surfels = Surfels(points, normals, jnp.float32(2.5))
+    return DevicePart(arrays, surfels, jnp.eye(4)[None], jnp.float32(0.1), jnp.eye(4)[None], jnp.zeros(1, bool))
