@@ -84,6 +84,7 @@ from kmn_jax.detection._search import (
 from kmn_jax.detection._seeds import NUM_SEEDS, seeds_at, seeds_over, spread_seeds
 from kmn_jax.detection._selection import Selection, select, select_poses
 from kmn_jax.detection._sources import GraspSource, MeshLike, PartSource, ScanSource
+from kmn_jax.detection._surroundings import Surroundings, surroundings
 from kmn_jax.detection._timing import Clock
 
 __all__ = [
@@ -131,6 +132,7 @@ __all__ = [
     "Scene",
     "SearchConfig",
     "Selection",
+    "Surroundings",
     "Timing",
     "as_json",
     "away_from_empty",
@@ -199,6 +201,7 @@ __all__ = [
     "select_poses",
     "spread_seeds",
     "surface_scores",
+    "surroundings",
     "symmetry_transforms",
     "table",
     "vouched",

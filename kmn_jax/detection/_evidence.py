@@ -10,6 +10,7 @@ from kmn_jax.detection._crop_search import CropPoses, Prediction
 from kmn_jax.detection._depth_agreement import DepthAgreement, DepthAgreementConfig, DepthImage, depth_agreement
 from kmn_jax.detection._mapping import map_real
 from kmn_jax.detection._picture_agreement import PictureAgreement, picture_agreement
+from kmn_jax.detection._surroundings import Surroundings, surroundings
 from kmn_jax.geometry import inverse, nearest, transform_points
 from kmn_jax.objects import PartArrays
 from kmn_jax.pose import PoseResult
@@ -17,7 +18,7 @@ from kmn_jax.programs import kept
 from kmn_jax.simulate import Surfels
 from kmn_jax.typing import Pose, Scalar
 
-# Each is described where it is computed: of the picture in `PictureAgreement` and `DepthAgreement`.
+# Each is described where it is computed: `DepthAgreement`, `PictureAgreement` and `Surroundings` are of the picture.
 _OF_CROP = (
     "surface",  # score of the crop's points, see `CropPoses`; of a refined pose that of the pose that it was made of
     "fit",  # share of the points on the object that are near to the pose's surface
@@ -30,7 +31,7 @@ _OF_CROP = (
     "certainty",  # mean probability of the likeliest keypoint
     "object_share",  # of the crop's points that are on the object
 )
-PICTURE_EVIDENCE = (*DepthAgreement._fields, *PictureAgreement._fields)
+PICTURE_EVIDENCE = (*DepthAgreement._fields, *PictureAgreement._fields, *Surroundings._fields)
 EVIDENCE = (*PICTURE_EVIDENCE, *_OF_CROP)
 _NEAR = 0.1  # diameters
 _SURFACE = 0.05  # diameters; points so near to a surface with a normal like it lie on it
@@ -89,8 +90,11 @@ def _evidence(
 def _of_picture(
     pose: Pose, surfels: Surfels, image: DepthImage, diameter: Scalar, config: DepthAgreementConfig
 ) -> dict[str, Scalar]:
-    picture = picture_agreement(pose, surfels, image, diameter)
-    return depth_agreement(pose, surfels, image, diameter, config)._asdict() | picture._asdict()
+    return {
+        **depth_agreement(pose, surfels, image, diameter, config)._asdict(),
+        **picture_agreement(pose, surfels, image, diameter)._asdict(),
+        **surroundings(pose, surfels, image, diameter)._asdict(),
+    }
 
 
 def _mean(values: Array, where: Bool[Array, " n"]) -> Scalar:

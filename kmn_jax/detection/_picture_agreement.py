@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Shaped
 
 from kmn_jax.detection._depth_agreement import DepthImage, depth_at
+from kmn_jax.detection._linear_fit import fit_linear
 from kmn_jax.geometry import transform_points
 from kmn_jax.simulate import Surfels
 from kmn_jax.typing import Pose, Scalar
@@ -28,12 +29,11 @@ _TIGHT, _NEAR, _LOOSE = 0.01, 0.02, 0.04  # between depths
 _LEVEL = 0.03  # the same, across the outline, where the surface may bend
 _ONE_SURFACE = 0.06  # between the depths of neighbouring cells, beyond what the slant of the view explains
 _STEEP = 2.5  # cells: that slant
-_STEP_SEEN, _STEP = 0.04, 0.08  # of depth between neighbouring cells, for an edge
 _ALIKE, _TURNED = 0.85, 0.5
 _PLANE, _PLANE_ALIKE = 0.015, 0.9  # of what lies in one plane
 _REACH = 3  # cells over which a plane is fitted
 _BELOW, _RAISED = 0.02, 0.5  # the plane around an object: so far below it is all below, so high at most counts
-_UNTILTED = 0.01  # square cells, added to how the outline spreads: cells in a row tell no tilt across
+_NO_RELIEF = 1e-4  # diameters: the least relief that two surfaces are alike in
 _FLATTEST = 1e-3  # of the nearest point's closeness: a plane is no farther than its inverse tells
 _HIGHEST = jax.lax.Precision.HIGHEST
 
@@ -58,15 +58,14 @@ class PictureAgreement(NamedTuple):
     noise: Scalar  # of depths within a cell, in diameters
     log_cells: Scalar
     log_area: Scalar  # of what is measured within 2%, in the square of the diameter
-    edges: Scalar  # of predicted steps in depth inside of the picture: those that are measured
-    strange_edges: Scalar  # of the cells inside: a step is measured, and none is predicted
+    relief: Scalar  # of what is measured within 4%: how far the object's own surface lies from its plane, in diameters
+    relief_alike: Scalar  # its correlation with what is measured; -1 to 1
+    relief_missed: Scalar  # how far the two are apart
     open: Scalar  # something farther away was measured, or nothing, as where the background is cut away
     stepped: Scalar  # something farther away by 1% of the diameter was measured
     level: Scalar  # the measured surface goes on
-    level_tightly: Scalar  # the same within 1%
     fronted: Scalar  # something in front was measured
     coplanar: Scalar  # the measured surface goes on in one plane
-    free_level: Scalar  # of the outline that nothing in front hides: the measured surface goes on
     buried: Scalar  # of the whole surface: below the plane of what surrounds it; by less than 2% it counts in part
     raised: Scalar  # mean height of that surface above the plane, seen from the camera, at most half a diameter
     surrounded: Scalar  # of the whole surface: inside of what is measured around it, see `_surroundings`
@@ -124,9 +123,6 @@ def picture_agreement(T_camera_object: Pose, surfels: Surfels, image: DepthImage
     cosine = (seen.normals * found.normals).sum(axis=-1)
     compared = loose & found.has_normal
     small = loose & (jnp.abs(gap) < _LOOSE)
-    inside = ~_grown(~mask)
-    predicted_step, measured_step = _steps(seen.depth, mask) / diameter, _steps(found.depth, there) / diameter
-    edges = inside & (predicted_step > _STEP)
     return PictureAgreement(
         tight=share(tight),
         near=share(near),
@@ -141,8 +137,7 @@ def picture_agreement(T_camera_object: Pose, surfels: Surfels, image: DepthImage
         noise=mean(found.noise, small) / diameter,
         log_cells=jnp.log1p(mask.sum(dtype=jnp.float32)),
         log_area=jnp.log(near.sum(dtype=jnp.float32) * (seen.pitch * seen.nearest / diameter) ** 2 + 1e-4),
-        edges=share(measured_step > _STEP_SEEN, edges),
-        strange_edges=share((measured_step > _STEP) & (predicted_step < _STEP_SEEN), inside),
+        **_relief(seen, found, loose, diameter),
         **_outline(seen, found, compared, diameter),
     )
 
@@ -222,32 +217,38 @@ def _surroundings(
     one standard deviation of the cells from their middle, and farther away, at d of these, by 1 / d^2: by a half on a
     ring of cells.
     """
-    weight = around.astype(jnp.float32).reshape(-1)
-    total = jnp.maximum(weight.sum(), 1)
-
-    def mean(values: Float[Array, " c"]) -> Scalar:
-        return (weight * values).sum() / total
-
-    # Over directions, the inverse depths of a plane are linear. Directions are taken from the middle, in cells.
-    u, v, closeness = (x.reshape(-1) for x in (seen.u, seen.v, seen.nearest / jnp.where(around, found.depth, 1)))
-    middle_u, middle_v, level = mean(u), mean(v), mean(closeness)
-    x, y, rise = (u - middle_u) / seen.pitch, (v - middle_v) / seen.pitch, closeness - level
-    xx, xy, yy = mean(x * x) + _UNTILTED, mean(x * y), mean(y * y) + _UNTILTED
-    along_x, along_y = mean(x * rise), mean(y * rise)
-    spread = xx * yy - xy**2
-    tilt_x, tilt_y = (yy * along_x - xy * along_y) / spread, (xx * along_y - xy * along_x) / spread
+    # Over directions, the inverse depths of a plane are linear.
+    plane = fit_linear(seen.nearest / jnp.where(around, found.depth, 1), around)
     z = jnp.maximum(seen.surface[:, 2], 1e-6 * diameter)
-    x, y = (seen.surface[:, 0] / z - middle_u) / seen.pitch, (seen.surface[:, 1] / z - middle_v) / seen.pitch
-    plane = seen.nearest / jnp.maximum(level + tilt_x * x + tilt_y * y, _FLATTEST)
-    height = jnp.where(around.any(), (plane - z) / diameter, 0)
+    x, y = ((seen.surface[:, axis] / z - first[0, 0]) / seen.pitch for axis, first in ((0, seen.u), (1, seen.v)))
+    depth = seen.nearest / jnp.maximum(plane.at(x, y), _FLATTEST)
+    height = jnp.where(around.any(), (depth - z) / diameter, 0)
     below = jnp.clip(-height / _BELOW, 0, 1)
-    off = jnp.maximum((yy * x * x - 2 * xy * x * y + xx * y * y) / spread, 1)
-    between = jnp.where(around.any(), 1 / off, 0)
+    between = jnp.where(around.any(), 1 / jnp.maximum(plane.away(x, y), 1), 0)
     return {
         "buried": below.mean(),
         "raised": jnp.clip(height, -_RAISED, _RAISED).mean(),
         "surrounded": between.mean(),
         "buried_between": (between * below).mean(),
+    }
+
+
+def _relief(seen: _Predicted, found: _Measured, compared: Bool[Array, "s s"], diameter: Scalar) -> dict[str, Scalar]:
+    """Return how an object's surface departs from its plane, and whether what is measured does so, too."""
+    rows, columns = (grid.astype(jnp.float32) for grid in jnp.indices(compared.shape))
+
+    def departing(depth: Float[Array, "s s"]) -> Float[Array, "s s"]:
+        away = jnp.where(compared, depth - seen.nearest, 0) / diameter
+        return jnp.where(compared, away - fit_linear(away, compared).at(columns, rows), 0)
+
+    def mean(values: Float[Array, "s s"]) -> Scalar:
+        return values.sum() / jnp.maximum(compared.sum(dtype=jnp.float32), 1)
+
+    own, measured = departing(seen.depth), departing(found.depth)
+    return {
+        "relief": jnp.sqrt(mean(own**2)),
+        "relief_alike": mean(own * measured) / jnp.sqrt(jnp.maximum(mean(own**2) * mean(measured**2), _NO_RELIEF**4)),
+        "relief_missed": jnp.sqrt(mean((own - measured) ** 2)),
     }
 
 
@@ -280,10 +281,8 @@ def _outline(seen: _Predicted, found: _Measured, compared: Bool[Array, "s s"], d
         "open": share(~found.there | (gap > _LEVEL)),
         "stepped": share(there & (gap > _TIGHT)),
         "level": share(level),
-        "level_tightly": share(there & (jnp.abs(gap) <= _TIGHT)),
         "fronted": share(fronted),
         "coplanar": share(coplanar),
-        "free_level": share(level, outline & ~fronted),
         **_surroundings(seen, found, there & ~fronted, diameter),
     }
 
@@ -316,8 +315,3 @@ def _most(values: Float[Array, "s s"]) -> Float[Array, "s s"]:
 
 def _summed(values: Float[Array, "s s c"], reach: int) -> Float[Array, "s s c"]:
     return _along_both(values, reach, 0.0, lambda shifted: shifted.sum(axis=0))
-
-
-def _steps(depth: Float[Array, "s s"], of: Bool[Array, "s s"]) -> Float[Array, "s s"]:
-    """Return the difference of the farthest and the nearest depth around each cell; not finite where there is none."""
-    return _most(jnp.where(of, depth, -jnp.inf)) + _most(jnp.where(of, -depth, -jnp.inf))

@@ -15,7 +15,7 @@ from tests.reference.meshes import pose
 
 PART = box_part()
 SURFELS = Surfels(jnp.asarray(PART.points), jnp.asarray(PART.normals), jnp.float32(PART.area))
-NO_SHARES = ("offset", "log_cells", "log_area", "deviation", "noise", "raised")
+NO_SHARES = ("offset", "log_cells", "log_area", "deviation", "noise", "raised", "relief_alike")
 compare = jax.jit(picture_agreement)
 
 
@@ -197,18 +197,24 @@ def test_noise_and_turned_normals_are_measured(depth: jax.Array) -> None:
     assert slanted.near == 1
 
 
-def test_a_step_that_is_predicted_and_one_that_is_not(depth: jax.Array) -> None:
+def test_relief_that_is_measured_and_relief_that_is_not(depth: jax.Array) -> None:
     camera, diameter, T = intrinsics(CAMERA), jnp.float32(2**0.5), jnp.asarray(pose((0.0, 0.0, 3.0)), jnp.float32)
     flat = plate()
-    stairs = flat._replace(points=flat.points.at[:, 2].set(jnp.where(flat.points[:, 0] > 0, 0.2, 0.0)))
-    columns = jnp.arange(CAMERA.width, dtype=jnp.float32)[None] > CAMERA.cx
-    stepped = jnp.where(columns, 3.2, jnp.full_like(depth, 3.0))
-    both, neither = (
+    ridge = flat._replace(points=flat.points.at[:, 2].set(0.1 * jnp.abs(flat.points[:, 0])))  # within 4%
+    x = (jnp.arange(CAMERA.width, dtype=jnp.float32)[None] - CAMERA.cx) / CAMERA.fx * 3
+    wall = jnp.full_like(depth, 3.0)
+    bent = wall + 0.1 * jnp.abs(x)
+    both, missing, strange, neither = (
         compare(T, one, DepthImage(image, camera), diameter)
-        for one, image in ((stairs, stepped), (flat, jnp.full_like(depth, 3.0)))
+        for one, image in ((ridge, bent), (ridge, wall), (flat, bent), (flat, wall))
     )
-    missing = compare(T, stairs, DepthImage(jnp.full_like(depth, 3.0), camera), diameter)
-    strange = compare(T, flat, DepthImage(stepped, camera), diameter)
-    assert both.edges > 0.4  # cells on both sides of the step, of which some are one off
-    assert (neither.edges, neither.strange_edges, missing.edges) == (0, 0, 0)
-    assert strange.strange_edges > 1.5 * both.strange_edges
+    # |x| over (-1/2, 1/2) departs from its mean by a root of 1/48; what is a little tilted is as flat.
+    assert both.relief == pytest.approx(0.1 * 48**-0.5 / 2**0.5, rel=0.1)
+    assert both.relief_alike > 0.95
+    assert both.relief_missed < 0.2 * both.relief
+    assert missing.relief_missed == pytest.approx(float(missing.relief), rel=0.1)
+    assert strange.relief < 0.1 * both.relief < strange.relief_missed
+    assert abs(missing.relief_alike) < 0.3
+    assert neither.relief_missed < 0.02 * both.relief
+    tilted = compare(T, flat, DepthImage(wall + 0.03 * x, camera), diameter)
+    assert tilted.relief_missed < 0.05 * both.relief
