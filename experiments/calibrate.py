@@ -49,6 +49,8 @@ def calibrate(options: Options) -> dict[str, Any]:
     """Fit, write and print. Raises InputError if there is nothing to fit to."""
     if options.method != "kmn_jax" and options.output is None:
         raise InputError("say where the probabilities of another method shall go: --output FILE")
+    if options.judge_anew and (options.candidates is None or not options.candidates.exists()):
+        raise InputError("there are no poses to judge anew: name a file of them by --candidates")
     output = options.output or (SHIPPED if options.model is None else calibration_beside(options.model))
     for target in (output, options.candidates, options.json, options.picture):
         check_target(target)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
@@ -13,7 +13,7 @@ from zipfile import BadZipFile
 
 import jax
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 from tqdm import tqdm
 
 from experiments.bins import TrueImage, WorldImage, bin_images, world_images
@@ -83,23 +83,25 @@ class Search(NamedTuple):
     is_known: bool  # whether the network was trained with such parts
 
     def columns(self, found: Candidates) -> dict[str, np.ndarray]:
-        """Return evidence, errors and object of poses; those of a part that is not there have no finite errors."""
-        poses = self.scene.T_scene_camera @ found.T_camera_object[found.usable]
-        errors = [
-            errors.min(axis=1, initial=np.inf)
-            for errors in (self.image.errors(poses), self.image.largest_errors(poses))
-        ]
-        if self.part is not self.image.part:
-            errors = [np.full_like(error, np.inf) for error in errors]
+        """Return evidence, errors and object of poses."""
+        poses = found.T_camera_object[found.usable]
         return {
             "evidence": found.evidence[found.usable],
-            "error": errors[0],
-            "largest_error": errors[1],
+            "error": self.errors(poses, self.image.errors),
+            "largest_error": self.errors(poses, self.image.largest_errors),
             "object": np.full(len(poses), self.number),
             "search": np.full(len(poses), self.row),
             "narrowed": np.full(len(poses), self.scene.is_narrowed),
-            "T_camera_object": found.T_camera_object[found.usable],  # to try other evidence on
+            "T_camera_object": poses,  # to judge it by other evidence
         }
+
+    def errors(
+        self, T_camera_object: Float32[np.ndarray, "s 4 4"], measure: Callable[[np.ndarray], np.ndarray]
+    ) -> Float[np.ndarray, " s"]:
+        """Return by how much poses are off the nearest copy; of a part that is not there, by no finite number."""
+        if self.part is not self.image.part:
+            return np.full(len(T_camera_object), np.inf)
+        return measure(self.scene.T_scene_camera @ T_camera_object).min(axis=1, initial=np.inf)
 
 
 class _Searched(NamedTuple):
@@ -119,25 +121,26 @@ def poses_to_fit(
     that were chosen by the evidence of before, and evidence that is not used any more is kept. Raises InputError if
     what is stored is of other bins, weights or settings, or lacks evidence that comes of crops.
     """
-    made_of, names = _made_of(sources, fits, network), list(EVIDENCE)
+    made_of = _made_of(sources, fits, network)
+    names: tuple[str, ...] = EVIDENCE
     if stored is None or not stored.exists():
         poses = collect(sources, fits, network)
     else:
         poses = _read(stored, made_of)
-        names = poses.pop("names").tolist()
+        names, used = (tuple(poses.pop(key).tolist()) for key in ("names", "used"))
         lacking = sorted(set(EVIDENCE) - {*names, *PICTURE_EVIDENCE})
         if lacking:
             raise InputError(f"{stored} lacks {', '.join(lacking)}, which comes of crops: remove it, to search again")
-        if set(EVIDENCE) <= set(names) and not sources.judge_anew:
+        if used == EVIDENCE and not sources.judge_anew:
             return poses | {"evidence": poses["evidence"][:, [names.index(name) for name in EVIDENCE]]}
         unused = [column for column, name in enumerate(names) if name not in EVIDENCE]
         kept = poses["evidence"][:, unused]
         poses = judged_anew(poses, names, sources, fits, network)
         poses["evidence"] = np.concatenate([poses["evidence"], kept], axis=1)
-        names = [*EVIDENCE, *(names[column] for column in unused)]
+        names = (*EVIDENCE, *(names[column] for column in unused))
     if stored is not None:
-        written, arrays = BytesIO(), poses | {"names": np.array(names), "made_of": np.array(made_of)}
-        np.savez(written, **cast(dict[str, Any], arrays))
+        written, of = BytesIO(), {"made_of": made_of, "names": names, "used": EVIDENCE}  # used: for what is reported
+        np.savez(written, **cast(dict[str, Any], poses | {key: np.array(value) for key, value in of.items()}))
         write_whole(stored, written.getvalue())
     return poses | {"evidence": poses["evidence"][:, : len(EVIDENCE)]}
 
@@ -147,9 +150,9 @@ def _read(stored: Path, made_of: str) -> dict[str, np.ndarray]:
     try:
         with np.load(stored) as file:
             poses = dict(file)
-    except (OSError, ValueError, TypeError, BadZipFile) as error:
+    except (OSError, EOFError, ValueError, TypeError, BadZipFile) as error:
         raise InputError(f"{stored} holds no poses ({shown(error)}): remove it") from None
-    if str(poses.pop("made_of", "")) != made_of or set(poses) != {*_COLUMNS, "names"}:
+    if str(poses.pop("made_of", "")) != made_of or set(poses) != {*_COLUMNS, "names", "used"}:
         raise InputError(f"{stored} holds poses of other bins, weights or settings: remove it")
     return poses
 
@@ -179,7 +182,7 @@ def collect(sources: Sources, fits: FitOptions, network: Model) -> dict[str, np.
 
 
 def judged_anew(
-    poses: dict[str, np.ndarray], names: list[str], sources: Sources, fits: FitOptions, network: Model
+    poses: dict[str, np.ndarray], names: tuple[str, ...], sources: Sources, fits: FitOptions, network: Model
 ) -> dict[str, np.ndarray]:
     """Return poses with the evidence of today: what comes of crops is what they have, by `names`, the rest computed.
 
@@ -195,8 +198,9 @@ def judged_anew(
         rows = np.flatnonzero(poses["search"] == search.row)
         if len(rows):
             searched[search.row] = _Searched(search.on_device, search.is_known)
-            _check(bool((poses["object"][rows] == search.number).all()))
             found = poses["T_camera_object"][rows]
+            _check(bool((poses["object"][rows] == search.number).all()))
+            _check(np.allclose(search.errors(found[:1], search.image.errors), poses["error"][rows[:1]], atol=1e-4))
             seen = picture_evidence(found, search.on_device, search.scene, config.agreement)
             evidence[np.ix_(rows, of_picture)] = seen
     _check(set(poses["search"].tolist()) == set(searched))

@@ -103,6 +103,13 @@ def depth_at(image: DepthImage, x: Float[Array, "*s"], y: Float[Array, "*s"]) ->
     return _value(image.depth, row, column)
 
 
+def in_image(image: DepthImage, x: Float[Array, "*s"], y: Float[Array, "*s"]) -> Bool[Array, "*s"]:
+    """Tell which directions (x, y, 1) fall into pixels of the camera: depth may be padded beyond these."""
+    camera = image.camera
+    column, row = jnp.round(camera.fx * x + camera.cx), jnp.round(camera.fy * y + camera.cy)
+    return (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+
+
 def measured_at(image: DepthImage, points: Float[Array, "m 3"]) -> tuple[Float[Array, "m 3"], Bool[Array, " m"]]:
     """Return what was measured in the pixels that points fall into, and whether anything was: else the points."""
     row, column, _ = _pixels(points, points[:, 2] > 0, image.camera)

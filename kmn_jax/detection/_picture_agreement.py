@@ -7,15 +7,14 @@ cells of a grid over the object's picture, each with a depth and a normal as pre
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Shaped
+from jaxtyping import Array, Bool, Float
 
-from kmn_jax.detection._depth_agreement import DepthImage, depth_at
-from kmn_jax.detection._linear_fit import fit_linear
+from kmn_jax.detection._cells import fit_plane, grown, most, places_of, summed
+from kmn_jax.detection._depth_agreement import DepthImage, depth_at, in_image
 from kmn_jax.geometry import transform_points
 from kmn_jax.simulate import Surfels
 from kmn_jax.typing import Pose, Scalar
@@ -33,8 +32,7 @@ _ALIKE, _TURNED = 0.85, 0.5
 _PLANE, _PLANE_ALIKE = 0.015, 0.9  # of what lies in one plane
 _REACH = 3  # cells over which a plane is fitted
 _BELOW, _RAISED = 0.02, 0.5  # the plane around an object: so far below it is all below, so high at most counts
-_NO_RELIEF = 1e-4  # diameters: the least relief that two surfaces are alike in
-_FLATTEST = 1e-3  # of the nearest point's closeness: a plane is no farther than its inverse tells
+_NO_RELIEF = 1e-3  # diameters: with less, a surface is as good as flat
 _HIGHEST = jax.lax.Precision.HIGHEST
 
 
@@ -58,8 +56,8 @@ class PictureAgreement(NamedTuple):
     noise: Scalar  # of depths within a cell, in diameters
     log_cells: Scalar
     log_area: Scalar  # of what is measured within 2%, in the square of the diameter
-    relief: Scalar  # of what is measured within 4%: how far the object's own surface lies from its plane, in diameters
-    relief_alike: Scalar  # its correlation with what is measured; -1 to 1
+    relief: Scalar  # where differences in depth are small: how far the object's surface departs from its plane
+    relief_alike: Scalar  # its correlation with what is measured, towards 0 where one of them is flat; -1 to 1
     relief_missed: Scalar  # how far the two are apart
     open: Scalar  # something farther away was measured, or nothing, as where the background is cut away
     stepped: Scalar  # something farther away by 1% of the diameter was measured
@@ -68,7 +66,7 @@ class PictureAgreement(NamedTuple):
     coplanar: Scalar  # the measured surface goes on in one plane
     buried: Scalar  # of the whole surface: below the plane of what surrounds it; by less than 2% it counts in part
     raised: Scalar  # mean height of that surface above the plane, seen from the camera, at most half a diameter
-    surrounded: Scalar  # of the whole surface: inside of what is measured around it, see `_surroundings`
+    surrounded: Scalar  # of the whole surface: inside of what is measured around it, see `_beside_outline`
     buried_between: Scalar  # buried, where each point of the surface counts as much as it is surrounded
 
 
@@ -137,7 +135,7 @@ def picture_agreement(T_camera_object: Pose, surfels: Surfels, image: DepthImage
         noise=mean(found.noise, small) / diameter,
         log_cells=jnp.log1p(mask.sum(dtype=jnp.float32)),
         log_area=jnp.log(near.sum(dtype=jnp.float32) * (seen.pitch * seen.nearest / diameter) ** 2 + 1e-4),
-        **_relief(seen, found, loose, diameter),
+        **_relief(seen, found, small, diameter),
         **_outline(seen, found, compared, diameter),
     )
 
@@ -175,8 +173,6 @@ def _predicted(T_camera_object: Pose, surfels: Surfels, image: DepthImage) -> _P
 
 def _measured(seen: _Predicted, image: DepthImage, diameter: Scalar) -> _Measured:
     samples = jnp.stack([depth_at(image, seen.u + du * seen.pitch, seen.v + dv * seen.pitch) for du, dv in _SAMPLES])
-    column, row = image.camera.fx * seen.u + image.camera.cx, image.camera.fy * seen.v + image.camera.cy
-    in_image = (column >= 0) & (column < image.camera.width) & (row >= 0) & (row < image.camera.height)
     real = samples > 0
     there = real.any(axis=0)
     anchor = jnp.where(real[0], samples[0], samples[1:].max(axis=0))
@@ -192,7 +188,16 @@ def _measured(seen: _Predicted, image: DepthImage, diameter: Scalar) -> _Measure
     length = jnp.sqrt(jnp.maximum((normals**2).sum(axis=-1, keepdims=True), 1e-24))
     normals = normals / length
     normals = jnp.where((normals * points).sum(axis=-1, keepdims=True) > 0, -normals, normals)
-    return _Measured(in_image, there, depth, away, noise, points, normals, has_u & has_v & (length[..., 0] > 1e-12))
+    return _Measured(
+        in_image(image, seen.u, seen.v),
+        there,
+        depth,
+        away,
+        noise,
+        points,
+        normals,
+        has_u & has_v & (length[..., 0] > 1e-12),
+    )
 
 
 def _slope(
@@ -208,7 +213,7 @@ def _slope(
     return ways[0] + ways[1], known[0] | known[1]
 
 
-def _surroundings(
+def _beside_outline(
     seen: _Predicted, found: _Measured, around: Bool[Array, "s s"], diameter: Scalar
 ) -> dict[str, Scalar]:
     """Return how an object's whole surface lies to the plane of what is measured around it; in it if nothing is.
@@ -217,14 +222,12 @@ def _surroundings(
     one standard deviation of the cells from their middle, and farther away, at d of these, by 1 / d^2: by a half on a
     ring of cells.
     """
-    # Over directions, the inverse depths of a plane are linear.
-    plane = fit_linear(seen.nearest / jnp.where(around, found.depth, 1), around)
+    plane = fit_plane(found.depth, around, seen.nearest)
     z = jnp.maximum(seen.surface[:, 2], 1e-6 * diameter)
     x, y = ((seen.surface[:, axis] / z - first[0, 0]) / seen.pitch for axis, first in ((0, seen.u), (1, seen.v)))
-    depth = seen.nearest / jnp.maximum(plane.at(x, y), _FLATTEST)
-    height = jnp.where(around.any(), (depth - z) / diameter, 0)
+    height = jnp.where(around.any(), (plane.depth(x, y) - z) / diameter, 0)
     below = jnp.clip(-height / _BELOW, 0, 1)
-    between = jnp.where(around.any(), 1 / jnp.maximum(plane.away(x, y), 1), 0)
+    between = jnp.where(around.any(), 1 / jnp.maximum(plane.closeness.away(x, y), 1), 0)
     return {
         "buried": below.mean(),
         "raised": jnp.clip(height, -_RAISED, _RAISED).mean(),
@@ -233,40 +236,40 @@ def _surroundings(
     }
 
 
-def _relief(seen: _Predicted, found: _Measured, compared: Bool[Array, "s s"], diameter: Scalar) -> dict[str, Scalar]:
-    """Return how an object's surface departs from its plane, and whether what is measured does so, too."""
-    rows, columns = (grid.astype(jnp.float32) for grid in jnp.indices(compared.shape))
+def _relief(seen: _Predicted, found: _Measured, of: Bool[Array, "s s"], diameter: Scalar) -> dict[str, Scalar]:
+    """Return how an object's surface departs from its plane in some cells, and whether what is measured does."""
 
     def departing(depth: Float[Array, "s s"]) -> Float[Array, "s s"]:
-        away = jnp.where(compared, depth - seen.nearest, 0) / diameter
-        return jnp.where(compared, away - fit_linear(away, compared).at(columns, rows), 0)
+        plane = fit_plane(depth, of, seen.nearest)
+        return jnp.where(of, depth - plane.depth(*places_of(depth)), 0) / diameter
 
     def mean(values: Float[Array, "s s"]) -> Scalar:
-        return values.sum() / jnp.maximum(compared.sum(dtype=jnp.float32), 1)
+        return values.sum() / jnp.maximum(of.sum(dtype=jnp.float32), 1)
 
     own, measured = departing(seen.depth), departing(found.depth)
+    sizes = [jnp.sqrt(jnp.maximum(mean(away**2), _NO_RELIEF**2)) for away in (own, measured)]
     return {
         "relief": jnp.sqrt(mean(own**2)),
-        "relief_alike": mean(own * measured) / jnp.sqrt(jnp.maximum(mean(own**2) * mean(measured**2), _NO_RELIEF**4)),
+        "relief_alike": mean(own * measured) / (sizes[0] * sizes[1]),
         "relief_missed": jnp.sqrt(mean((own - measured) ** 2)),
     }
 
 
 def _outline(seen: _Predicted, found: _Measured, compared: Bool[Array, "s s"], diameter: Scalar) -> dict[str, Scalar]:
     """Return how the measured surface goes on beyond the outline, and how the object's lies to it."""
-    edge = _grown(seen.mask)
-    outline = _grown(edge) & ~edge & found.in_image
+    edge = grown(seen.mask)
+    outline = grown(edge) & ~edge & found.in_image
     # Of cells without depth, the farthest of those around, twice.
     depth = jnp.where(seen.mask, seen.depth, -jnp.inf)
     for _ in range(2):
-        depth = jnp.where(jnp.isfinite(depth), depth, _most(depth))
+        depth = jnp.where(jnp.isfinite(depth), depth, most(depth))
     gap = jnp.where(outline & found.there, found.depth - depth, 0) / diameter
     there = outline & found.there
     fronted = there & (gap < -_LEVEL)
     level = there & (jnp.abs(gap) <= _LEVEL)
     # The plane of what is measured on the object near by.
     count, normal, center = (
-        _summed(jnp.where(compared[..., None], values, 0), _REACH)
+        summed(jnp.where(compared[..., None], values, 0), _REACH)
         for values in (jnp.ones((_SIDE, _SIDE, 1)), found.normals, found.points)
     )
     normal = normal / jnp.sqrt(jnp.maximum((normal**2).sum(axis=-1, keepdims=True), 1e-24))
@@ -283,35 +286,5 @@ def _outline(seen: _Predicted, found: _Measured, compared: Bool[Array, "s s"], d
         "level": share(level),
         "fronted": share(fronted),
         "coplanar": share(coplanar),
-        **_surroundings(seen, found, there & ~fronted, diameter),
+        **_beside_outline(seen, found, there & ~fronted, diameter),
     }
-
-
-def _around(values: Shaped[Array, "s s ..."], reach: int, fill: float | bool) -> list[Shaped[Array, "s s ..."]]:
-    """Return an image shifted by up to so many cells along its first axis."""
-    rest = [(0, 0)] * (values.ndim - 1)
-    padded = jnp.pad(values, [(reach, reach), *rest], constant_values=fill)
-    return [padded[step : step + values.shape[0]] for step in range(2 * reach + 1)]
-
-
-def _along_both(
-    values: Shaped[Array, "s s ..."],
-    reach: int,
-    fill: float | bool,
-    join: Callable[[Shaped[Array, "k s s ..."]], Shaped[Array, "s s ..."]],
-) -> Shaped[Array, "s s ..."]:
-    for _ in range(2):
-        values = jnp.swapaxes(join(jnp.stack(_around(values, reach, fill))), 0, 1)
-    return values
-
-
-def _grown(mask: Bool[Array, "s s"]) -> Bool[Array, "s s"]:
-    return _along_both(mask, 1, False, lambda shifted: shifted.any(axis=0))
-
-
-def _most(values: Float[Array, "s s"]) -> Float[Array, "s s"]:
-    return _along_both(values, 1, -jnp.inf, lambda shifted: shifted.max(axis=0))
-
-
-def _summed(values: Float[Array, "s s c"], reach: int) -> Float[Array, "s s c"]:
-    return _along_both(values, reach, 0.0, lambda shifted: shifted.sum(axis=0))

@@ -218,3 +218,23 @@ def test_relief_that_is_measured_and_relief_that_is_not(depth: jax.Array) -> Non
     assert neither.relief_missed < 0.02 * both.relief
     tilted = compare(T, flat, DepthImage(wall + 0.03 * x, camera), diameter)
     assert tilted.relief_missed < 0.05 * both.relief
+
+
+def test_the_background_is_no_relief_nor_is_the_slant_of_a_plate(depth: jax.Array) -> None:
+    camera, diameter = intrinsics(CAMERA), jnp.float32(2**0.5)
+    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
+    x, y = (columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy
+    turn = np.pi / 9
+    T = np.eye(4)
+    T[:3, :3] = [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
+    T[:3, :3] = T[:3, :3] @ [[0.5**0.5, 0, 0.5**0.5], [0, 1, 0], [-(0.5**0.5), 0, 0.5**0.5]]
+    T[2, 3] = 4.0
+    away = 4.0 * T[2, 2] / (T[0, 2] * x + T[1, 2] * y + T[2, 2])
+    local = np.stack([x * away, y * away, away - 4.0], axis=-1) @ T[:3, :3]
+    own = np.abs(local[..., :2]).max(axis=-1) <= 0.5
+    for background in (5.0, 8.0):
+        image = jnp.asarray(np.where(own, away, background), dtype=jnp.float32)
+        found = compare(jnp.asarray(T, dtype=jnp.float32), plate(), DepthImage(image, camera), diameter)
+        assert found.near > 0.9
+        assert found.relief < 3e-3
+        assert found.relief_missed < 5e-3

@@ -59,7 +59,13 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def searches(sources: Sources, network: Any) -> Any:
         for row in range(2):
-            yield SimpleNamespace(row=row, on_device=row, scene=row, is_known=row == 1, number=7 + row)
+            image = SimpleNamespace(errors=None)
+            yield SimpleNamespace(
+                row=row, on_device=row, scene=row, is_known=row == 1, number=7 + row, image=image, errors=errors
+            )
+
+    def errors(poses: np.ndarray, measure: Any) -> np.ndarray:
+        return np.full(len(poses), 0.01)
 
     def shown(poses: np.ndarray, part: int, scene: int, agreement: Any) -> np.ndarray:
         assert agreement == DetectConfig().search.agreement
@@ -92,6 +98,7 @@ def store(path: Path, network: Model, names: tuple[str, ...] = EVIDENCE, **other
     stored = {
         "made_of": np.array(module._made_of(Sources(), FitOptions(), network)),
         "names": np.array(names),
+        "used": np.array(names),
         "evidence": np.tile(np.arange(len(names), dtype=np.float32), (6, 1)),
         "error": np.full(6, 0.01),
         "largest_error": np.array([0.01, 0.2, 0.2, 0.2, 0.01, 0.01]),
@@ -115,6 +122,7 @@ def test_stored_poses_are_judged_anew_by_other_evidence(
     path, names = tmp_path / "poses.npz", ("what is gone", *reversed(_OF_CROPS))
     store(path, network, names)
     poses = poses_to_fit(Sources(), FitOptions(), network, path)
+    assert poses["evidence"].shape == (6, len(EVIDENCE))
     for name in EVIDENCE:
         column = poses["evidence"][:, EVIDENCE.index(name)]
         if name in PICTURE_EVIDENCE:
@@ -153,7 +161,8 @@ def test_stored_poses_that_cannot_be_judged_anew_stay(tmp_path: Path, network: M
     with pytest.raises(InputError, match=f"lacks {EVIDENCE[-1]}, which comes of crops"):
         poses_to_fit(Sources(), FitOptions(), network, path)
     assert path.read_bytes() == before
-    for wrong in ({"object": np.full(6, 7)}, {"search": np.array([0, 0, 0, 0, 1, 2])}):
+    other_images = {"error": np.array([0.01, 0.01, 0.01, 0.01, 0.3, 0.01])}
+    for wrong in ({"object": np.full(6, 7)}, {"search": np.array([0, 0, 0, 0, 1, 2])}, other_images):
         store(path, network, **wrong)
         with pytest.raises(InputError, match="not those that the stored poses were found in"):
             poses_to_fit(anew, FitOptions(), network, path)
@@ -165,9 +174,12 @@ def test_poses_of_other_bins_are_refused(tmp_path: Path) -> None:
         store(path, load_pretrained(), **wrong)
         with pytest.raises(InputError, match="holds poses of other bins, weights or settings: remove it"):
             calibrate(Options(candidates=path, output=output))
-    path.write_bytes(b"no numbers")
-    with pytest.raises(InputError, match="holds no poses"):
-        calibrate(Options(candidates=path, output=output))
+    for content in (b"", b"no numbers"):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match="holds no poses"):
+            calibrate(Options(candidates=path, output=output))
+    with pytest.raises(InputError, match="no poses to judge anew"):
+        calibrate(Options(candidates=tmp_path / "none.npz", output=output, judge_anew=True))
     assert not output.exists()
 
 
