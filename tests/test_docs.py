@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,18 @@ def like_the_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for folder in ("benchmarks", "configs", "docs", "experiments", "kmn_jax"):
         (tmp_path / folder).symlink_to(ROOT / folder)
     monkeypatch.chdir(tmp_path)
+
+
+def test_each_table_has_as_many_columns_below_its_head_as_in_it() -> None:
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "kmn_jax" / "pretrained").glob("*.md")]
+    tables = 0
+    for page in pages:
+        lines = page.read_text(encoding="utf-8").splitlines()
+        for head, rule in pairwise(lines):
+            if re.fullmatch(r"\|(\s*:?-+:?\s*\|)+", rule):
+                assert len(re.findall(r"(?<!\\)\|", head)) == rule.count("|"), f"{page.name}: {head}"
+                tables += 1
+    assert tables > 20
 
 
 def test_every_room_has_its_page_of_the_reference() -> None:
