@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from kmn_jax.detection._depth_agreement import DepthImage, measured_at
 from kmn_jax.detection._device_part import DevicePart
-from kmn_jax.geometry import compose, from_rotation_translation, rotate_vectors, transform_points
+from kmn_jax.geometry import compose, from_rotation_translation, rotate_vectors, smallest_at, transform_points
 from kmn_jax.pose import plane_step, rotation_is_determined
 from kmn_jax.programs import kept
 from kmn_jax.simulate import SplatConfig, visible_by_splatting
@@ -54,8 +54,8 @@ def polished(pose: Pose, part: DevicePart, image: DepthImage) -> Pose:
         return _Fit(moved, normals, (normals * apart).sum(axis=1), near)
 
     def reach(fit: _Fit) -> Scalar:
-        ordered = jnp.sort(jnp.where(fit.near, jnp.abs(fit.residual), jnp.inf))
-        median = ordered[fit.near.sum(dtype=jnp.int32) // 2]
+        apart = jnp.where(fit.near, jnp.abs(fit.residual), jnp.inf)
+        median = smallest_at(apart, fit.near.sum(dtype=jnp.int32) // 2)
         return _SPREADS * jnp.clip(jnp.where(jnp.isfinite(median), median, 0), _LEAST_SPREAD, _GATE)
 
     def moved_on(pose: Pose, _: None) -> tuple[Pose, None]:

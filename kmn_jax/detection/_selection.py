@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from kmn_jax.detection._device_part import DevicePart
 from kmn_jax.detection._mapping import map_real
-from kmn_jax.geometry import compose, inverse, squared_distances, transform_points
+from kmn_jax.geometry import compose, inverse, safe_norm, squared_distances, transform_points
 from kmn_jax.pose import mssd
 from kmn_jax.programs import kept
 from kmn_jax.typing import Normals, Points, Pose, Scalar
@@ -46,9 +46,12 @@ def select(
     """
     points, normals = part.arrays.points[:_POINTS], part.arrays.normals[:_POINTS]
     diameter = part.arrays.diameter
-    centers = jax.vmap(transform_points, in_axes=(0, None))(poses, points.mean(axis=0)[None])[:, 0]
+    middle = points.mean(axis=0)
+    centers = jax.vmap(transform_points, in_axes=(0, None))(poses, middle[None])[:, 0]
     apart = jnp.sqrt(((centers[:, None] - centers[None]) ** 2).sum(axis=2))
     spacing = jnp.sqrt(part.surfels.area / points.shape[0])
+    radius = safe_norm(points - middle[None]).max()
+    touching = 2 * radius + DEPTH * diameter + spacing  # farther apart, no point of one is in or on the other
 
     def same(row: Int[Array, ""]) -> Bool[Array, " s"]:
         # The mean of the points moves no farther than the farthest of them.
@@ -58,7 +61,7 @@ def select(
     one_each, _ = _greedy(score, usable, same)
 
     def clashing(row: Int[Array, ""]) -> Bool[Array, " s"]:
-        near = (apart[row] <= 2 * diameter) & one_each
+        near = (apart[row] <= touching) & one_each
 
         def clash(pose: Pose) -> Bool[Array, ""]:
             return overlap(poses[row], pose, points, normals, spacing, DEPTH * diameter) > OVERLAP

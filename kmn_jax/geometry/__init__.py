@@ -33,7 +33,7 @@ from kmn_jax.geometry._se3 import (
     safe_sqrt,
     transform_points,
 )
-from kmn_jax.geometry._selection import ask_for_fast_selection, largest
+from kmn_jax.geometry._selection import ask_for_fast_selection, largest, smallest_at
 from kmn_jax.geometry._smoothing import SmoothConfig, smoothed, with_normals
 
 __all__ = [
@@ -78,6 +78,7 @@ __all__ = [
     "rotation_angle_between",
     "safe_norm",
     "safe_sqrt",
+    "smallest_at",
     "smoothed",
     "solve_symmetric",
     "space_filling_order",

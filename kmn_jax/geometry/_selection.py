@@ -1,4 +1,4 @@
-"""The largest of each row: on accelerators without a full sort, which a promised order of ties would take there."""
+"""The largest of each row, and the one at a place in order: without a full sort where that takes long."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from importlib.util import find_spec
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, Shaped
+from jaxtyping import Array, Float32, Int, Shaped
 
 # From version 0.11 on JAX takes a promise back; before that, XLA has to be told: see `ask_for_fast_selection`.
 _ANY_TIES = {"is_stable": False} if "is_stable" in inspect.signature(jax.lax.top_k).parameters else {}
@@ -40,6 +40,27 @@ def largest_in_any_order(values: Shaped[Array, "... n"], k: int) -> tuple[Shaped
     found = jnp.take_along_axis(groups, chosen[..., None], axis=-2)
     best, places = _selected(found.reshape(*values.shape[:-1], k * size), k)
     return best, size * jnp.take_along_axis(chosen, places // size, axis=-1) + places % size
+
+
+def smallest_at(values: Float32[Array, " n"], place: Int[Array, ""]) -> Float32[Array, ""]:
+    """Return the number at a place among n in order, the smallest at 0; none may be below zero, inf may be there."""
+    return jax.lax.platform_dependent(
+        values, place, cpu=smallest_by_bits, default=lambda values, place: jnp.sort(values)[place]
+    )
+
+
+def smallest_by_bits(values: Float32[Array, " n"], place: Int[Array, ""]) -> Float32[Array, ""]:
+    """Return the same bit by bit: CPUs count eight numbers at once, but sort one by one.
+
+    Floats of zero and above are in the order of the integers that their bits are.
+    """
+    codes = jax.lax.bitcast_convert_type(values, jnp.int32)
+
+    def add_bit(step: Int[Array, ""], found: Int[Array, ""]) -> Int[Array, ""]:
+        larger = found | (jnp.int32(1) << (30 - step))
+        return jnp.where((codes < larger).sum(dtype=jnp.int32) <= place, larger, found)
+
+    return jax.lax.bitcast_convert_type(jax.lax.fori_loop(0, 31, add_bit, jnp.int32(0)), jnp.float32)
 
 
 def _group_size(count: int, k: int) -> int:

@@ -117,6 +117,18 @@ def test_the_best_of_what_excludes_each_other_is_taken() -> None:
     np.testing.assert_array_equal(taken(score * 0), [True, False, True, False, False])
 
 
+def test_parts_too_far_apart_to_touch_are_two_also_if_all_that_is_known_of_one_is_its_inside() -> None:
+    """From anywhere outside, a point is behind the nearest bit of a hollow ball, whose surface faces inwards."""
+    angle, height = np.arange(128) * 2.4, np.linspace(-0.99, 0.99, 128)
+    ring = np.sqrt(1 - height**2)
+    ball = np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1).astype(np.float32)
+    hollow = replace(BOX, points=ball, normals=-ball, minimum=-np.ones(3), maximum=np.ones(3), diameter=2.0, area=12.6)
+    score = np.array([0.9, 0.8])
+    for away, both in ((2.6, True), (0.5, False)):
+        found = chosen(np.stack([np.eye(4), moved(away, 0, 0)]), score, part=hollow)
+        assert found.kept.tolist() == [True, both]
+
+
 def test_slender_parts_side_by_side_are_two() -> None:
     x, y, z = BOX.maximum - BOX.minimum
     assert same_place(BOX) == pytest.approx(min(0.2 * BOX.diameter, sorted((x, y, z))[1] / 2))

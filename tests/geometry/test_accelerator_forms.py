@@ -18,6 +18,7 @@ from kmn_jax.geometry import (
     largest,
     neighbor_graph,
     normals_within_radius,
+    smallest_at,
 )
 from tests.reference.devices import accelerator_forms
 
@@ -42,6 +43,7 @@ def points() -> jax.Array:
         lambda x: largest(x[:, 0], 30),
         lambda x: largest(jnp.where(x[:100, :1] > 0, jnp.tile(x.reshape(1, -1)[:, :128], (100, 1)), -jnp.inf), 3),
         lambda x: jnp.sort(neighbor_graph(x[:128], 3, jnp.arange(128) % 5 > 0)),
+        lambda x: smallest_at(jnp.abs(x[:, 0]), jnp.int32(7)),
     ],
     ids=[
         "k_nearest",
@@ -54,6 +56,7 @@ def points() -> jax.Array:
         "selection",
         "selection from groups",
         "neighbors from groups",
+        "the number at a place",
     ],
 )
 def test_both_forms_agree(function: Callable[[jax.Array], Any], points: jax.Array) -> None:
