@@ -83,13 +83,20 @@ class DetectConfig:
             )
 
     def search_of(self, config: KeyMatchNetConfig, at_places: bool = False) -> SearchConfig:
-        """Return how is searched with a network: around seeds all over the scene, or at places that are given."""
-        crops = self.search.crops.of_network(config)
-        return replace(self.search, crops=replace(crops, give_up=crops.give_up or (self.give_up and not at_places)))
+        """Return how is searched with a network: around seeds all over the scene, or at places that are given.
+
+        All over a scene draws have as many points as the network was trained with, unless their number is given.
+        """
+        crops = self.search.crops
+        if not at_places:
+            crops = replace(
+                crops, give_up=crops.give_up or self.give_up, num_points=crops.num_points or config.num_scene_points
+            )
+        return replace(self.search, crops=crops.of_network(config))
 
 
 FAST = DetectConfig(search=SearchConfig(crops=CropSearchConfig(num_draws=1, num_points=512)))  # measured with `small`
-THOROUGH = DetectConfig(patience=None, give_up=False)
+THOROUGH = DetectConfig(search=SearchConfig(crops=CropSearchConfig(num_points=1024)), patience=None, give_up=False)
 Effort = Literal["fast", "usual", "thorough"]
 
 
