@@ -30,6 +30,7 @@ from kmn_jax.detection import (
 from kmn_jax.geometry import Intrinsics, PaddedCloud
 from kmn_jax.models import RELEASED_CONFIG, Compute, KeyMatchNetConfig, load_pretrained, model_structure, released_file
 from kmn_jax.objects import PartArrays
+from kmn_jax.released import RELEASED
 from kmn_jax.simulate import Surfels
 from kmn_jax.train import create_state, data_mesh, jit_train_step
 
@@ -66,7 +67,7 @@ def programs(devices: int) -> list[Program]:
 
 def _steps() -> Iterator[tuple[str, Compute, int]]:
     yield "small", "float32", 64
-    yield "worlds_long", "float32", 128
+    yield "wide_long", "float32", 128
     yield "paper", "float32", 14
     yield "paper", "bfloat16", 14
     for compute in COMPUTES:
@@ -98,7 +99,7 @@ def _crops(batch: int) -> Program:
     """The released network, from a scan's points to refined poses."""
 
     def make(devices: list[Any]) -> tuple[Any, tuple[Any, ...]]:
-        model = load_pretrained("small")
+        model = load_pretrained()
         part = _part(model.config)
         config = replace(SEARCH.of_network(model.config), side_by_side=True)  # what a device would have it be
 
@@ -114,21 +115,21 @@ def _crops(batch: int) -> Program:
         keys = _array((batch, 2), jnp.uint32)
         return jax.jit(solve), _on(devices, (model.parameters, part, clouds, keys))
 
-    return Program(f"crop to poses, {batch} crops, small", batch, "crop", make)
+    return Program(f"crop to poses, {batch} crops, {RELEASED}", batch, "crop", make)
 
 
 def _bin(seeds: int) -> Program:
     """The released network, from a depth image to ranked poses."""
 
     def make(devices: list[Any]) -> tuple[Any, tuple[Any, ...]]:
-        model = load_pretrained("small")
+        model = load_pretrained()
         points = _array((_SURFELS, 3), jnp.float32)
         surfels = Surfels(points, points, _array((), jnp.float32))
         poses = _array((_SYMMETRIES, 4, 4), jnp.float32)
         rivals = _array((_LOOK_ALIKES, 4, 4), jnp.float32), _array((_LOOK_ALIKES,), jnp.bool_)
         part = DevicePart(_part(model.config), surfels, poses, _array((), jnp.float32), *rivals)
-        search = BinPosesConfig().search
-        search = replace(search, crops=replace(search.crops.of_network(model.config), side_by_side=True))
+        search = BinPosesConfig().search.of_network(model.config)
+        search = replace(search, crops=replace(search.crops, side_by_side=True))
         config = BinPosesConfig(num_seeds=seeds, search=search)
 
         def solve(parameters: nnx.State, part: Any, calibration: Any, image: Any, inside: Any, key: jax.Array) -> Any:
@@ -137,13 +138,13 @@ def _bin(seeds: int) -> Program:
 
         number = _array((), jnp.float32)
         image = DepthImage(_array(_IMAGE, jnp.float32), Intrinsics(*[number] * 6))
-        stored = load_probabilities(calibration_beside(released_file("small")), EVIDENCE)
+        stored = load_probabilities(calibration_beside(released_file()), EVIDENCE)
         own = device_calibration(stored.found)
         calibration = CalibrationArrays(*(_array(leaf.shape, leaf.dtype) for leaf in own))
         inside, key = _array(_IMAGE, jnp.bool_), _array((2,), jnp.uint32)
         return jax.jit(solve), _on(devices, (model.parameters, part, calibration, image, inside, key))
 
-    return Program(f"bin in one call, {seeds} seeds, small", 1, "bin", make)
+    return Program(f"bin in one call, {seeds} seeds, {RELEASED}", 1, "bin", make)
 
 
 def _part(config: KeyMatchNetConfig) -> PartArrays:

@@ -165,11 +165,10 @@ def crop_row(batch: int, repeats: int) -> dict[str, Any]:
 def bin_row(estimator: PoseEstimator, image: BinImage, config: BinPosesConfig, repeats: int) -> dict[str, Any]:
     """Time one call, and the search in rounds, on the same image; count what each finds."""
     model, scene = estimator.model, image.scene
-    search = replace(config.search, crops=config.search.crops.of_network(model.config))
     part, calibration = device_part(model, image.part), device_calibration(estimator.probabilities.found)
     measured = scene.image._replace(depth=jnp.asarray(scene.depth))
     inside, key = jnp.asarray(image.inside), jax.random.key(0)
-    config = replace(config, search=search)
+    config = replace(config, search=config.search.of_network(model.config))
     call = partial(bin_poses, *model, part, calibration, measured, inside, key, config=config)
     found = jax.device_get(call())
     with jax.transfer_guard("disallow"):

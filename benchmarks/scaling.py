@@ -31,6 +31,7 @@ from kmn_jax.detection import map_real, poses_in_crop, search_crop, spread_seeds
 from kmn_jax.models import load_pretrained
 from kmn_jax.objects import arrays_of, make_part, save_part
 from kmn_jax.pose import RansacConfig, ransac
+from kmn_jax.released import RELEASED
 from kmn_jax.report import print_table, write_json
 from kmn_jax.train import split_cpu
 
@@ -187,7 +188,7 @@ def device_rows(repeats: int) -> list[dict[str, Any]]:
 
 def catalogue_rows() -> list[dict[str, Any]]:
     """Measure what one object of a catalogue takes on disk and on the device, and how long it takes to encode."""
-    model = load_pretrained("small")
+    model = load_pretrained()
     found, _ = small_case()
     part = make_part(found, model)
     with tempfile.TemporaryDirectory() as folder:
@@ -196,7 +197,7 @@ def catalogue_rows() -> list[dict[str, Any]]:
         stored = path.stat().st_size
     held = sum(leaf.nbytes for leaf in jax.tree.leaves(arrays_of(model, part)))
     ms = time_in_turn({"encode": lambda: make_part(found, model)}, 9)["encode"].median_ms
-    return [{"network": "small", "card kB": stored / 1e3, "on the device kB": held / 1e3, "encode ms": ms}]
+    return [{"network": RELEASED, "card kB": stored / 1e3, "on the device kB": held / 1e3, "encode ms": ms}]
 
 
 def plan_rows(search: Growth, each: Mapping[str, Any]) -> list[dict[str, Any]]:

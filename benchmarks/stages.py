@@ -65,7 +65,7 @@ class SmallCrop(NamedTuple):
 
 def small_crop() -> SmallCrop:
     """Return the crop of `small_case`, as calls take it."""
-    model = load_pretrained("small")
+    model = load_pretrained()
     found, case = small_case()
     return SmallCrop(model, arrays_of(model, make_part(found, model)), padded(case.points))
 

@@ -12,10 +12,11 @@ worlds
                python -m experiments.train worlds --warm-start FILE
     Hardware:  2 CPU cores: 15 minutes for the pack; 55 to 60 samples/s, half as many beside other work.
     Expected:  after 168,000 samples, 0.9 h beside other work: validation loss 2.149, segmentation accuracy 0.956,
-               keypoint accuracy 0.152 of 64. These are the released weights, to go on from without --warm-start. FILE
-               were those of 160,000 samples in worlds of components, with invariant inputs and 20 keypoints (1.627 and
-               0.231 of 20; `experiments/assets/worlds.safetensors` at commit a4dca0e, where the run was called
-               `chiral`), which had begun with the 560,000 above.
+               keypoint accuracy 0.152 of 64. These weights, `experiments/assets/small.safetensors`, were released
+               before those of `wide_long`; without --warm-start it goes on from them. FILE were those of 160,000
+               samples in worlds of components, with invariant inputs and 20 keypoints (1.627 and 0.231 of 20;
+               `experiments/assets/worlds.safetensors` at commit a4dca0e, where the run was called `chiral`), which had
+               begun with the 560,000 above.
 
 worlds_long
     With the 1,024 points that a search draws.
@@ -23,8 +24,7 @@ worlds_long
     Hardware:  one H200, 11 minutes beside other runs, 3 of them until the first step; 5,600 samples/s in the median,
                7,000 at best.
     Expected:  after 1,792,000 samples: validation loss 2.044, segmentation accuracy 0.957, keypoint accuracy 0.168 of
-               64; docs/training.md says why they are not released. The weights are
-               `experiments/assets/worlds_long.safetensors`.
+               64; docs/training.md says why they were not released.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ worlds = replace(
     small,
     name="worlds",
     pack="outputs/packs/surfels",
-    warm_start="small",
+    warm_start="experiments/assets/small.safetensors",
     num_steps=10_500,
     examples=replace(
         small.examples,

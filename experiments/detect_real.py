@@ -24,6 +24,7 @@ from kmn_jax.bop import FrameKey
 from kmn_jax.detection import PoseEstimator
 from kmn_jax.errors import InputError
 from kmn_jax.io import Scan, read_scan
+from kmn_jax.released import RELEASED
 from kmn_jax.report import check_target, print_table, write_json
 from kmn_jax.units import check_unit
 
@@ -35,7 +36,7 @@ class Options:
     """What to detect in, by what."""
 
     folder: Annotated[Path, tyro.conf.Positional]
-    weights: str = "small"
+    weights: str = RELEASED
     json: Path | None = None
 
 

@@ -18,6 +18,7 @@ from kmn_jax.errors import InputError, number_list, require
 from kmn_jax.extras import install_command
 from kmn_jax.files import check_outputs, write_whole
 from kmn_jax.printing import drop_what_is_printed, open_closed_streams, say
+from kmn_jax.released import RELEASED
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -64,7 +65,7 @@ class Request:
     pose in the robot's frame, in which poses are then told, too."""
     grasps: Path | None = None
     """File of the object's grasps, see docs/grasps.md: poses then carry those that are free."""
-    weights: str = "small"
+    weights: str = RELEASED
     """Released network, or a .safetensors file."""
 
 
@@ -72,7 +73,7 @@ def prepare(
     source: Annotated[Path, tyro.conf.Positional],
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None,
     units: Units = "auto",
-    weights: str = "small",
+    weights: str = RELEASED,
 ) -> None:
     """Make an object card, so that later calls need not read and encode the CAD file.
 
@@ -194,7 +195,7 @@ def serve(
     max_megabytes: float = 100.0,
     max_queue: int = 16,
     time_limit: float = 120.0,
-    weights: str = "small",
+    weights: str = RELEASED,
 ) -> None:
     """Answer searches over HTTP, as docs/serve.md tells, until the process is told to stop.
 
@@ -224,7 +225,7 @@ def export(
     units: Units = "auto",
     object_units: Units = "auto",
     points: int = 65_536,
-    weights: str = "small",
+    weights: str = RELEASED,
 ) -> None:
     """Write the estimator of one part as a file that runs where JAX does, without this package.
 
@@ -273,7 +274,7 @@ def _ask(request: Request, server: str, top: int | None, picture: bool) -> Serve
     """Return what a server finds."""
     from kmn_jax.serve import detect_on_server
 
-    if request.weights != "small":
+    if request.weights != RELEASED:
         raise InputError("the server has weights of its own: leave out --weights, or start it with them")
     if request.base_camera is not None or request.grasps is not None:
         raise InputError("a server knows no robot: leave out --base-camera and --grasps, or search here")

@@ -29,7 +29,21 @@ ROOMS = (
     "cli",
 )
 RANKS = dict.fromkeys(
-    ("typing", "errors", "units", "extras", "files", "limits", "programs", "report", "web", "arguments", "printing"), 0
+    (
+        "typing",
+        "errors",
+        "units",
+        "extras",
+        "files",
+        "limits",
+        "programs",
+        "released",
+        "report",
+        "web",
+        "arguments",
+        "printing",
+    ),
+    0,
 ) | {name: rank for rank, name in enumerate(ROOMS, start=1)}
 # Pairs of neighbours that the ranks alone would allow: the pose solver takes arrays, not models.
 FORBIDDEN = {("kmn_jax.pose", "kmn_jax.models"), ("benchmarks", "experiments"), ("experiments", "benchmarks")}

@@ -34,6 +34,7 @@ from typing import Literal
 import numpy as np
 
 from kmn_jax.errors import InputError
+from kmn_jax.released import RELEASED
 
 Source = Literal["bop", "clouds"]
 METHODS = (
@@ -66,7 +67,7 @@ class EvaluateConfig:
     crops: int = 100  # of each object and noise
     noise: tuple[float, ...] = (0.0, 0.01, 0.05)  # share of the object's longest side
     methods: tuple[str, ...] = METHODS
-    weights: str = "small"  # released network, or a .safetensors file
+    weights: str = RELEASED  # released network, or a .safetensors file
     random_seed: int = 0
 
     def __post_init__(self) -> None:

@@ -30,7 +30,7 @@ from kmn_jax.typing import PRNGKey
 
 @dataclass(frozen=True)
 class BinPosesConfig:
-    """How a bin is searched in one call; `search` is that of a network, see `CropSearchConfig.of_network`."""
+    """How a bin is searched in one call; `search` is that of a network, see `SearchConfig.of_network`."""
 
     num_seeds: int = 32  # crops that are searched: more than copies that may be seen, as some share one
     max_points: int = 32_768  # of the image that are kept, evenly over all that were measured

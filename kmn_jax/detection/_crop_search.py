@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -64,7 +64,7 @@ class CropSearchConfig:
     num_modes: int = 4  # poses of each draw that are compared with the surface
     num_poses: int = 3  # that are refined and returned: the best ones that differ
     distinct: float = 0.1  # how far apart, somewhere on the surface, poses differ
-    num_points: int | None = None  # of a draw; unless given, by the network: see `of_network`
+    num_points: int | None = None  # of a draw; by the network unless given, see `of_network`
     crop_points: int = 4096  # of the crop at least, from which normals are estimated
     smooth: SmoothConfig | None = field(default_factory=SmoothConfig)
     matches: MatchConfig = field(default_factory=lambda: MatchConfig(capacity=1024, least_points=40))
@@ -223,19 +223,22 @@ def draws_in_turn(
         wanted = valid & (state.num_draws < config.num_draws) & is_unsure(state.scores.max(), config)
         return (state.num_draws == 0) | wanted
 
+    def scored_by(count: int) -> Callable[[PoseResult, Prediction], Float[Array, " h"]]:
+        return lambda found, made: scored(found, jax.tree.map(lambda leaf: leaf[:count], made))
+
     def make(state: DrawsSearch) -> DrawsSearch:
-        draw = state.num_draws
-        prediction, found = one(draw)
-        predictions = jax.tree.map(lambda leaf, new: leaf.at[draw].set(new), state.predictions, prediction)
-        poses = jax.tree.map(lambda leaf, new: leaf.at[draw].set(new), state.poses, found)
-        return DrawsSearch(draw + 1, predictions, poses, state.scores.at[draw].set(scored(found, predictions)))
+        draw, new = state.num_draws, one(state.num_draws)
+        made: Any = jax.tree.map(lambda leaf, new: leaf.at[draw].set(new), (state.predictions, state.poses), new)
+        # Draws that are still to be made have no points, but would take as long to compare with.
+        scores = jax.lax.switch(draw, [scored_by(1 + row) for row in range(config.num_draws)], new[1], made[0])
+        return DrawsSearch(draw + 1, made[0], made[1], state.scores.at[draw].set(scores))
 
     def none(leaf: jax.ShapeDtypeStruct) -> Array:
         return jnp.zeros((config.num_draws, *leaf.shape), leaf.dtype)
 
-    predictions, poses = jax.tree.map(none, jax.eval_shape(one, jnp.int32(0)))
+    nothing: Any = jax.tree.map(none, jax.eval_shape(one, jnp.int32(0)))
     scores = jnp.full((config.num_draws, config.num_modes), -jnp.inf)
-    return jax.lax.while_loop(more, make, DrawsSearch(jnp.int32(0), predictions, poses, scores))
+    return jax.lax.while_loop(more, make, DrawsSearch(jnp.int32(0), nothing[0], nothing[1], scores))
 
 
 def draws_side_by_side(
@@ -333,26 +336,16 @@ def surface_scores(
 
     A score is that of `surface_agreement` and the share of matches that agree, -1 to 3 in sum.
     """
-    surface, normals = part.points[: config.surface_points], part.normals[: config.surface_points]
-    points, point_normals, mask, on_object = map(
-        _flat, (predictions.points, predictions.normals, predictions.mask, predictions.on_object)
-    )
+    surface = part.points[: config.surface_points], part.normals[: config.surface_points]
+    draws = predictions.points, predictions.normals, predictions.mask, predictions.on_object
+    points, normals, mask, taken = map(_flat, draws)
 
     def one(pose: PoseResult) -> Scalar:
         def compared() -> Scalar:
-            seen = surface_agreement(
-                pose.T_scene_object,
-                surface,
-                normals,
-                points,
-                point_normals,
-                mask,
-                on_object,
-                -seed,
-                part.diameter,
-                config.surface,
+            agreement = surface_agreement(
+                pose.T_scene_object, *surface, points, normals, mask, taken, -seed, part.diameter, config.surface
             )
-            return seen.score + pose.score
+            return agreement.score + pose.score
 
         return jax.lax.cond(pose.converged, compared, lambda: jnp.float32(-jnp.inf))
 

@@ -83,19 +83,14 @@ class DetectConfig:
             )
 
     def search_of(self, config: KeyMatchNetConfig, at_places: bool = False) -> SearchConfig:
-        """Return how is searched with a network: around seeds all over the scene, or at places that are given.
-
-        All over a scene draws have as many points as the network was trained with, unless their number is given.
-        """
-        crops = self.search.crops
-        if not at_places:
-            crops = replace(
-                crops, give_up=crops.give_up or self.give_up, num_points=crops.num_points or config.num_scene_points
-            )
-        return replace(self.search, crops=crops.of_network(config))
+        """Return how is searched with a network: around seeds all over the scene, or at places that are given."""
+        if at_places:
+            return replace(self.search, crops=self.search.crops.of_network(config))
+        search = self.search.of_network(config)
+        return replace(search, crops=replace(search.crops, give_up=search.crops.give_up or self.give_up))
 
 
-FAST = DetectConfig(search=SearchConfig(crops=CropSearchConfig(num_draws=1, num_points=512)))  # measured with `small`
+FAST = DetectConfig(search=SearchConfig(crops=CropSearchConfig(num_draws=1)))
 THOROUGH = DetectConfig(search=SearchConfig(crops=CropSearchConfig(num_points=1024)), patience=None, give_up=False)
 Effort = Literal["fast", "usual", "thorough"]
 

@@ -56,6 +56,7 @@ from kmn_jax.objects import (
     model_digest,
 )
 from kmn_jax.programs import read_kept
+from kmn_jax.released import RELEASED
 from kmn_jax.typing import ArrayInput
 from kmn_jax.units import Unit
 
@@ -76,17 +77,17 @@ class PoseEstimator:
     weights: str | None = None  # the name or file that the model was loaded by
 
     @classmethod
-    def from_pretrained(cls, weights: str | Path = "small", config: DetectConfig | None = None) -> PoseEstimator:
+    def from_pretrained(cls, weights: str | Path = RELEASED, config: DetectConfig | None = None) -> PoseEstimator:
         """Load a released network by its name, or one's own by its .safetensors file.
 
         Probabilities are those of the calibration beside the file (NAME.calibration.json); without one, those of the
-        released network `small`, and each result says so. Raises InputError if there is no such network.
+        released network, and each result says so. Raises InputError if there is no such network.
         """
         read_kept()
         path = Path(weights) if Path(weights).suffix == ".safetensors" else released_file(str(weights))
         model = load_model(path)
         own = calibration_beside(path).is_file()
-        probabilities = load_probabilities(calibration_beside(path if own else released_file("small")), EVIDENCE)
+        probabilities = load_probabilities(calibration_beside(path if own else released_file()), EVIDENCE)
         warnings = () if own else (_UNFITTED,)
         return cls(model, model_digest(model), probabilities, config or DetectConfig(), warnings, str(weights))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -57,7 +56,7 @@ def export_estimator(estimator: PoseEstimator, part: Part, path: str | Path, num
 def _program(estimator: PoseEstimator, part: Part) -> Callable[..., dict[str, Array]]:
     """Return the search as a function of arrays only; all else is part of the program."""
     model, search = estimator.model, estimator.config.search
-    config = BinPosesConfig(NUM_SEEDS, search=replace(search, crops=search.crops.of_network(model.config)))
+    config = BinPosesConfig(NUM_SEEDS, search=search.of_network(model.config))
     on_device, calibration = device_part(model, part), device_calibration(estimator.probabilities.found)
 
     def program(points: Float[Array, "r 3"], mask: Bool[Array, " r"], key: UInt32[Array, " 2"]) -> dict[str, Array]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int
 
 _TRIPLES = 1000  # of points, each of which may lie in the plane: one of a fifth of the points gets 8 of them
 _SAMPLE = 5000  # points by which planes are compared
@@ -49,12 +50,13 @@ def dominant_plane(
         return None
     normals, corner = normals[proper] / length[proper, None], corners[proper, 0]
     offsets = (normals * corner).sum(axis=1)
-    counts = np.concatenate(
-        [
-            (np.abs(sample @ normals[start : start + _CHUNK].T - offsets[start : start + _CHUNK]) <= margin).sum(axis=0)
-            for start in range(0, len(normals), _CHUNK)
-        ]
-    )
+
+    def counts_of(start: int) -> Int[np.ndarray, " c"]:
+        some = slice(start, start + _CHUNK)
+        return (np.abs(sample @ normals[some].T - offsets[some]) <= margin).sum(axis=0)
+
+    with ThreadPoolExecutor(2) as pool:  # NumPy lets others run as it counts
+        counts = np.concatenate(list(pool.map(counts_of, range(0, len(normals), _CHUNK))))
     best = int(counts.argmax())
     found = fitted_plane(everything, normals[best], float(offsets[best]), margin)
     offset = found.offset + float(found.normal @ center)

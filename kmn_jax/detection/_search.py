@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple, cast
 
@@ -25,7 +25,7 @@ from kmn_jax.detection._mapping import call_rows
 from kmn_jax.detection._result import CropPrediction
 from kmn_jax.detection._scene import Scene
 from kmn_jax.geometry import Crop, PaddedCloud
-from kmn_jax.models import Model
+from kmn_jax.models import KeyMatchNetConfig, Model
 from kmn_jax.objects import PartArrays
 from kmn_jax.pose import PoseResult
 from kmn_jax.typing import PRNGKey
@@ -39,6 +39,14 @@ class SearchConfig:
 
     crops: CropSearchConfig = field(default_factory=CropSearchConfig)
     agreement: DepthAgreementConfig = field(default_factory=DepthAgreementConfig)
+
+    def of_network(self, config: KeyMatchNetConfig) -> SearchConfig:
+        """Return the same with the number of points of a draw, unless it is given: that which it was trained with.
+
+        Of the many seeds of a scene, most of a copy's fail or succeed together; of a single one, more points find more,
+        see `CropSearchConfig.of_network`.
+        """
+        return replace(self, crops=replace(self.crops, num_points=self.crops.num_points or config.num_scene_points))
 
 
 class Candidates(NamedTuple):
@@ -61,7 +69,7 @@ class Candidates(NamedTuple):
 def search_at(
     model: Model, part: DevicePart, scene: Scene, rows: Int[np.ndarray, " c"], random_seed: int, config: SearchConfig
 ) -> Candidates:
-    """Return the poses in the crops around seeds; `config` is that of a network, see `CropSearchConfig.of_network`.
+    """Return the poses in the crops around seeds; `config` is that of a network, see `SearchConfig.of_network`.
 
     What is found around a point does not depend on what else is searched.
     """

@@ -16,6 +16,7 @@ from kmn_jax.files import read_safetensors, safetensors_bytes, write_whole
 from kmn_jax.limits import parse_json
 from kmn_jax.models._config import KeyMatchNetConfig
 from kmn_jax.models._keymatchnet import Model, model_structure
+from kmn_jax.released import RELEASED
 
 PRETRAINED = Path(__file__).parent.parent / "pretrained"  # released models, and what belongs to them
 _CONFIG_KEY = "kmn_jax.config"
@@ -39,7 +40,7 @@ def is_model_file(path: str | Path) -> bool:
         return False
 
 
-def released_file(name: str) -> Path:
+def released_file(name: str = RELEASED) -> Path:
     """Return the file of a released model, one of those in `kmn_jax/pretrained/`.
 
     Raises InputError if there is none of that name.
@@ -51,7 +52,7 @@ def released_file(name: str) -> Path:
     return path
 
 
-def load_pretrained(name: str = "small") -> Model:
+def load_pretrained(name: str = RELEASED) -> Model:
     """Load a released model; a card beside its file tells what it can do. Raises InputError if there is none."""
     return load_model(released_file(name))
 

@@ -20,6 +20,7 @@ from kmn_jax.detection import PoseEstimator
 from kmn_jax.errors import InputError, require
 from kmn_jax.io import CLOUD_SUFFIXES, MESH_SUFFIXES, Scan
 from kmn_jax.objects import CARD_SUFFIX, Part
+from kmn_jax.released import RELEASED
 from kmn_jax.serve._folder import private_folder
 from kmn_jax.serve._parts import PartStore, check_name
 from kmn_jax.serve._settings import ServeConfig
@@ -32,7 +33,7 @@ _AFTER_LIMITS = 10.0  # s that answers are waited for once all limits have passe
 
 def serve(
     config: ServeConfig,
-    weights: str = "small",
+    weights: str = RELEASED,
     parts: Path | None = None,
     example: Path | None = None,
     camera: Path | None = None,

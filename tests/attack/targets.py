@@ -144,7 +144,7 @@ def _card(folder: Path, path: Path) -> Any:
 
 def _calibration(path: Path) -> None:
     """Write the released probabilities with few trees: damage strikes what is around them, too."""
-    models = json.loads(calibration_beside(released_file("small")).read_bytes())
+    models = json.loads(calibration_beside(released_file()).read_bytes())
     for model in models.values():
         model |= {name: model[name][:3] for name in ("columns", "thresholds", "values")}
     path.write_text(json.dumps(models))

@@ -59,7 +59,7 @@ def cases(gear: ObjectImages) -> list[Case]:
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    return load_model(released_file("small"))
+    return load_model(released_file())
 
 
 @pytest.fixture(scope="module")
@@ -151,8 +151,9 @@ def test_one_draw_and_one_pose_are_the_published_search(model: Model, part: Part
 
 
 def test_poses_differ_the_best_first_and_are_refined(model: Model, part: PartArrays, cases: list[Case]) -> None:
+    case = cases[1]  # ICP leaves the pose of the first one as it is, where it found no better one
     rough, fine = (
-        jax.device_get(poses_at(model, part, padded(cases[0].points), 0, 0, replace(CONFIG, icp=icp)))
+        jax.device_get(poses_at(model, part, padded(case.points), 0, 0, replace(CONFIG, icp=icp)))
         for icp in (None, IcpConfig(iterations=8))
     )
     there = rough.poses.converged
@@ -166,8 +167,8 @@ def test_poses_differ_the_best_first_and_are_refined(model: Model, part: PartArr
     np.testing.assert_array_equal(fine.scores, rough.scores)
     moved = np.abs(fine.poses.T_scene_object - rough.poses.T_scene_object)[there].max(axis=(1, 2))
     assert moved[0] > 0  # a lesser pose may have nothing near it that ICP could pair
-    truth = min(float(adi(fine.poses.T_scene_object[0], pose, surface)) for pose in cases[0].T_camera_object)
-    before = min(float(adi(rough.poses.T_scene_object[0], pose, surface)) for pose in cases[0].T_camera_object)
+    truth = min(float(adi(fine.poses.T_scene_object[0], pose, surface)) for pose in case.T_camera_object)
+    before = min(float(adi(rough.poses.T_scene_object[0], pose, surface)) for pose in case.T_camera_object)
     assert truth < before + 0.01 * float(part.diameter)
 
 

@@ -31,6 +31,7 @@ from kmn_jax.errors import InputError
 from kmn_jax.io import Scan, read_mesh
 from kmn_jax.objects import ObjectConfig, Part, save_part
 from kmn_jax.pose import adi, mssd
+from kmn_jax.released import RELEASED
 from tests.reference.meshes import Mesh, box, random_rotations
 from tests.reference.meshes import pose as placed
 from tests.reference.solids import revolution
@@ -178,8 +179,8 @@ def test_a_driver_s_array_and_the_robot_s_frame(
     assert errors(shown, truth, motor).min() < 0.1
     values = turned.to_dict()
     assert values["scene"] is None
-    assert (values["seed"], values["weights"], values["model"]) == (0, "small", motor.model_digest)
-    facts = {"seed": 0, "weights": "small", "model": motor.model_digest}
+    assert (values["seed"], values["weights"], values["model"]) == (0, RELEASED, motor.model_digest)
+    facts = {"seed": 0, "weights": RELEASED, "model": motor.model_digest}
     assert list(as_json(turned, "motor.stl", "scan.ply", facts)) == list(values)
 
 
@@ -188,8 +189,7 @@ def test_candidates_have_evidence_and_some_are_right(
 ) -> None:
     scan, truth = seen
     scene = estimator.scene(scan, motor)
-    config = DetectConfig().search
-    config = replace(config, crops=config.crops.of_network(estimator.model.config))
+    config = DetectConfig().search.of_network(estimator.model.config)
     rows = seeds_over(scene, scene.foreground, motor)[:16]
     found = search_at(estimator.model, device_part(estimator.model, motor), scene, rows, 0, config)
     assert found.evidence.shape == (16 * config.crops.num_poses, len(EVIDENCE))

@@ -205,7 +205,7 @@ def test_clouds_with_poses_are_evaluated_from_their_sensor(tmp_path: Path, gear:
 
 
 def test_an_ablation_changes_one_choice_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    methods = ablate.methods_of(load_model(released_file("small")))
+    methods = ablate.methods_of(load_model(released_file()))
     plain = leaves(methods["ours"].settings)
     single = leaves(methods["one_RANSAC"].settings)
     for key, method in methods.items():
@@ -281,7 +281,7 @@ def test_networks_of_one_object_each_are_a_method(
     tmp_path: Path, gear: ObjectImages, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """An untrained one finds nothing much, but it is used for its object, and only there."""
-    config = replace(load_model(released_file("small")).config, object_branch="learned")
+    config = replace(load_model(released_file()).config, object_branch="learned")
     (tmp_path / "own").mkdir()
     save_model(create_model(config, jax.random.key(0)), tmp_path / "own" / f"{GEAR}.safetensors")
     options = ["demo", "--images", "1", "--crops", "2", "--methods", "per_object", "--output", str(tmp_path / "out")]

@@ -87,7 +87,7 @@ def test_the_released_model_does_what_its_card_says(tmp_path: Path) -> None:
     results = json.loads(path.read_text())
     card = evaluate_network.SHIPPED.with_suffix(".md").read_text()
     assert results["sha256"][:16] in card
-    assert load_pretrained("small").config.num_keypoints == 64
+    assert load_pretrained().config.num_keypoints == 64
     # Two objects of a few images: less exact than the card's seven, and better than chance by far.
     found, *_ = results["splits"]
     assert found["segmentation"] > 0.93
@@ -95,7 +95,7 @@ def test_the_released_model_does_what_its_card_says(tmp_path: Path) -> None:
 
 
 def test_a_model_that_was_never_released_is_refused() -> None:
-    with pytest.raises(InputError, match=r"there is no released model 'huge': there are small"):
+    with pytest.raises(InputError, match=r"there is no released model 'huge': there are wide"):
         load_pretrained("huge")
 
 

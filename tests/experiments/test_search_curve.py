@@ -72,9 +72,9 @@ def test_copies_and_times_stand_beside_those_of_the_search_as_it_is(
     monkeypatch.setattr(search_curve, "world_images", lambda *_: [object()] * 4)
     monkeypatch.setattr(search_curve, "load_pretrained", lambda: None)
     monkeypatch.setattr(search_curve, "_searched", fake)
-    options = Options(settings=("one draw", PLAIN), json=tmp_path / "curve.json", picture=tmp_path / "curve.png")
+    options = Options(settings=("two draws", PLAIN), json=tmp_path / "curve.json", picture=tmp_path / "curve.png")
     one, plain = run(options)
-    assert searched.count(PLAIN) == searched.count("one draw") == 5  # the first of each compiles, and is not counted
+    assert searched.count(PLAIN) == searched.count("two draws") == 5  # the first of each compiles, and is not counted
     assert (one["recall"], plain["recall"]) == (0.5, 1.0)
     assert (one["copies"], one["images"], one["median s"], one["times as long"]) == (8, 4, 1.0, 0.5)
     wide = [row["difference of recall, 95%"] for row in (one, plain)]
@@ -102,7 +102,7 @@ def test_bad_input_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="no settings are called 'none': choose among fast"):
         run(Options(settings=("none", PLAIN)))
     with pytest.raises(InputError, match="'as it is', which others are compared with, is missing"):
-        run(Options(settings=("one draw",)))
+        run(Options(settings=("two draws",)))
     monkeypatch.setattr(search_curve, "world_images", lambda *_: [])
     with pytest.raises(InputError, match=r"no image of .* was searched"):
         run(Options(settings=(PLAIN,)))

@@ -14,6 +14,7 @@ from experiments.evaluation.whole_bin import headline, num_right, whole_bin
 from kmn_jax.bop import bop_scan
 from kmn_jax.detection import Detections, PoseEstimator, Scene, Timing
 from kmn_jax.objects import Part
+from kmn_jax.released import RELEASED
 from tests.reference.meshes import pose
 
 SMALL = Path(evaluate.__file__).parent / "assets" / "small_test_set"
@@ -40,7 +41,7 @@ def test_the_fullest_image_is_searched_without_its_truth(
         return Detections(part.name, scene.unit, (), Timing({}, 0.0), "it was not searched")
 
     monkeypatch.setattr(PoseEstimator, "detect", detect)
-    drawn = whole_bin(objects, "small")
+    drawn = whole_bin(objects, RELEASED)
     (scene,) = searched
     scan, instances = bop_scan(FULLEST)
     assert instances is not None
@@ -53,7 +54,7 @@ def test_the_fullest_image_is_searched_without_its_truth(
     assert drawn.content.startswith(b"\x89PNG")
     assert drawn.title == f"0 of {len(instances)} copies found in this bin, no pose accepted"
     assert "(scene 1, image 3; " in drawn.text
-    assert whole_bin([], "small") is None
+    assert whole_bin([], RELEASED) is None
     assert whole_bin(objects, "none") is None
     assert "no whole bin is drawn: there is no released model" in capsys.readouterr().err
 

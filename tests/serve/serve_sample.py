@@ -20,6 +20,7 @@ from kmn_jax.detection import Detections, PoseEstimator, Scene
 from kmn_jax.errors import InputError
 from kmn_jax.io import Scan
 from kmn_jax.objects import Part
+from kmn_jax.released import RELEASED
 from kmn_jax.serve import ServeConfig
 from kmn_jax.serve._app import make_app
 from kmn_jax.serve._parts import PartStore
@@ -126,7 +127,7 @@ def running(
     known = KnownAnswer()
     known.may_answer.set()
     config = config or ServeConfig(port=0)
-    app = make_app(Searches(estimator or known, "small", PartStore(config.most_parts, {}), folder), config, warm_up)
+    app = make_app(Searches(estimator or known, RELEASED, PartStore(config.most_parts, {}), folder), config, warm_up)
     ready = threading.Event()
 
     class Told(uvicorn.Server):

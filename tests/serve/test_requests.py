@@ -14,6 +14,7 @@ import pytest
 
 from kmn_jax.detection import FAST, THOROUGH, as_json
 from kmn_jax.objects import Part
+from kmn_jax.released import RELEASED
 from kmn_jax.serve import ServeConfig, detect_on_server
 from kmn_jax.serve._app import detect
 from kmn_jax.serve._messages import DetectionResult, Health, PartInfo, PartList, PoseInfo, Problem
@@ -93,7 +94,7 @@ def test_a_search_answers_as_the_command_writes(server: Running) -> None:
     assert status == 200, said
     DetectionResult.model_validate(said)
     assert all(pose.keys() == PoseInfo.model_fields.keys() for pose in said["poses"])
-    expected = as_json(FOUND, "box", "scan.ply", {"seed": 7, "weights": "small", "model": "0"})
+    expected = as_json(FOUND, "box", "scan.ply", {"seed": 7, "weights": RELEASED, "model": "0"})
     assert said | {"timing": 0} == expected | {"timing": 0}
     assert {"total_s", "compile_s"} <= said["timing"].keys()
     assert headers["Part"] == "/parts/box"

@@ -47,7 +47,7 @@ def test_a_warm_start_begins_with_the_weights_of_a_file(tmp_path: Path) -> None:
     for leaf, wanted in zip(jax.tree.leaves(found), jax.tree.leaves(model[1]), strict=True):
         np.testing.assert_array_equal(leaf, wanted)
     with pytest.raises(InputError, match="another network than the config's"):
-        warm_parameters(replace(DEBUG, warm_start="small"))
+        warm_parameters(replace(DEBUG, warm_start="wide"))
     dynamic = replace(DEBUG.network, graph="dynamic")
     same = warm_parameters(replace(DEBUG, network=dynamic, warm_start=str(tmp_path / "some.safetensors")))
     assert jax.tree.all(jax.tree.map(np.array_equal, same, found))  # how neighbours are found has no parameters
