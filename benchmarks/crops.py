@@ -45,6 +45,7 @@ from kmn_jax.detection import (
 )
 from kmn_jax.models import Model
 from kmn_jax.objects import ObjectModel
+from kmn_jax.released import RELEASED
 from kmn_jax.report import print_table, write_json
 
 _RIVAL = "FPFH + RANSAC"
@@ -72,7 +73,7 @@ def main(
     same = [row for found in bop_objects(folder, "test", print) for row in same_crops(estimator.model, found, repeats)]
     print_table("the same crops, 1% noise, one after another", same)
     crops = [crop_row(batch, repeats) for batch in batches]
-    print_table("crops to refined poses, `small`", crops)
+    print_table(f"crops to refined poses, `{RELEASED}`", crops)
     config = BinPosesConfig(num_seeds=seeds)
     images = bin_images(folder, "test", estimator.model, every)
     bins = [bin_row(estimator, image, config, repeats) for image in images]

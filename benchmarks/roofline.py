@@ -20,6 +20,7 @@ from benchmarks.network_cases import make_case
 from benchmarks.stages import Stage, network_call, network_stages, pose_stages, training_stages
 from benchmarks.timing import Ceilings, measure_ceilings, time_in_turn
 from benchmarks.work import Work, total
+from kmn_jax.released import RELEASED
 from kmn_jax.report import print_table, write_json
 
 # Measured on such a machine: 8192 x 8192 bfloat16 products of random data, and device-to-device copies. The first, of
@@ -46,7 +47,7 @@ def main(repeats: int = 15, training: tuple[str, ...] = ("small", "base"), json:
     case = make_case(1)
     tables = {
         "network": ("network with cached object features, N = 2048, batch 1", network_stages(case), network_call(case)),
-        "pose": ("`small`, from a scan to the refined pose of one crop", pose_stages(), None),
+        "pose": (f"`{RELEASED}`, from a scan to the refined pose of one crop", pose_stages(), None),
         "training": ("training", training_stages(training, jax.default_backend() == "cpu"), None),
     }
     for key, (title, stages, whole) in tables.items():

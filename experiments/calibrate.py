@@ -28,10 +28,11 @@ from experiments.reliability_picture import save_reliability
 from kmn_jax.detection import Probabilities, calibration_beside, load_lightgbm, probabilities_bytes
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
-from kmn_jax.models import load_model, load_pretrained, released_file
+from kmn_jax.models import PRETRAINED, load_model, load_pretrained
+from kmn_jax.released import RELEASED
 from kmn_jax.report import check_target, print_table, write_json
 
-SHIPPED = calibration_beside(released_file())
+SHIPPED = calibration_beside(PRETRAINED / f"{RELEASED}.safetensors")
 
 
 @dataclass(frozen=True)

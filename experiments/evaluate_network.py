@@ -25,7 +25,8 @@ from kmn_jax.bop import NAMES_FILE
 from kmn_jax.data import CropConfig, DevicePack, Pack, PipelineConfig, SampleBatches, stack_pack
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import SmoothConfig
-from kmn_jax.models import LossConfig, Model, load_model, released_file
+from kmn_jax.models import PRETRAINED, LossConfig, Model, load_model
+from kmn_jax.released import RELEASED
 from kmn_jax.report import check_target, print_table, write_json
 from kmn_jax.train import (
     ExampleConfig,
@@ -42,7 +43,7 @@ from kmn_jax.train import (
     total_sums,
 )
 
-SHIPPED = released_file()
+SHIPPED = PRETRAINED / f"{RELEASED}.safetensors"
 _PUBLISHED_KEYPOINTS = 20
 _TEST_SETS = (Path("outputs/test_sets/electronics"), Path("outputs/test_sets/industrial"))
 

@@ -217,7 +217,10 @@ def draws_in_turn(
     valid: Bool[Array, ""],
     config: CropSearchConfig,
 ) -> DrawsSearch:
-    """Make draws one after the other, given what makes one and what scores its poses by the draws so far."""
+    """Make draws one after the other, given what makes one and what scores its poses by the draws so far.
+
+    Under `vmap` each draw would be compared with in all of its ways: then make them side by side.
+    """
 
     def more(state: DrawsSearch) -> Bool[Array, ""]:
         wanted = valid & (state.num_draws < config.num_draws) & is_unsure(state.scores.max(), config)

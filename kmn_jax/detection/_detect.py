@@ -64,6 +64,7 @@ class DetectConfig:
 
     search: SearchConfig = field(default_factory=SearchConfig)
     give_up: bool = True  # on seeds whose first draw has no pose; not where places are given
+    many_points: bool = False  # in each draw, see `CropSearchConfig.of_network`; always where places are given
     patience: int | None = 2  # rounds that find no copy, after which it is not searched finely; None goes on
     later_seeds: int = 16  # at most in a round after the first; rounds go on until the foreground is covered
     most_seeds: int = 512  # at least so many are searched before it is given up to cover the foreground
@@ -84,14 +85,17 @@ class DetectConfig:
 
     def search_of(self, config: KeyMatchNetConfig, at_places: bool = False) -> SearchConfig:
         """Return how is searched with a network: around seeds all over the scene, or at places that are given."""
-        if at_places:
-            return replace(self.search, crops=self.search.crops.of_network(config))
-        search = self.search.of_network(config)
-        return replace(search, crops=replace(search.crops, give_up=search.crops.give_up or self.give_up))
+        crops = self.search.crops
+        if at_places or self.many_points:
+            search = replace(self.search, crops=crops.of_network(config))
+        else:
+            search = self.search.of_network(config)
+        give_up = crops.give_up or (self.give_up and not at_places)
+        return replace(search, crops=replace(search.crops, give_up=give_up))
 
 
 FAST = DetectConfig(search=SearchConfig(crops=CropSearchConfig(num_draws=1)))
-THOROUGH = DetectConfig(search=SearchConfig(crops=CropSearchConfig(num_points=1024)), patience=None, give_up=False)
+THOROUGH = DetectConfig(patience=None, give_up=False, many_points=True)
 Effort = Literal["fast", "usual", "thorough"]
 
 

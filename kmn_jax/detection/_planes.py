@@ -92,7 +92,7 @@ def _local_triples(sample: Float[np.ndarray, "n 3"], generator: np.random.Genera
 
     first = generator.integers(0, len(sample), _TRIPLES)
     count = min(_NEAR, len(sample))
-    _, near = cKDTree(sample).query(sample[first], k=count, workers=-1)
+    _, near = cKDTree(sample).query(sample[first], k=count, workers=2)
     columns = generator.integers(0, count, (_TRIPLES, 2))
     others = np.take_along_axis(near, columns, axis=1)
     return sample[np.concatenate([first[:, None], others], axis=1)]

@@ -15,9 +15,11 @@ from kmn_jax.detection import (
     Candidates,
     CropPoses,
     CropSearchConfig,
+    DetectConfig,
     DevicePart,
     Scene,
     SearchConfig,
+    config_of,
     gather_evidence,
     make_scene,
     picture_evidence,
@@ -184,3 +186,16 @@ def test_the_picture_shows_the_same_of_poses_that_were_kept(part: DevicePart, sc
     assert np.ptp(seen, axis=0).max() > 0.1
     assert picture_evidence(poses[:0], part, scene, CONFIG.agreement).shape == (0, len(columns))
     np.testing.assert_allclose(_columns_of(poses, part.surfels, scene.image, 2.0, CONFIG.agreement), seen, atol=1e-5)
+
+
+@pytest.mark.parametrize(("trained", "many"), [(512, 1024), (2048, 2048)])
+def test_draws_have_as_many_points_as_the_network_was_trained_with_or_more_where_they_are_few(
+    trained: int, many: int
+) -> None:
+    network = replace(NETWORK, num_scene_points=trained)
+    for effort, everywhere in (("fast", trained), ("usual", trained), ("thorough", many)):
+        config = config_of(effort)
+        assert config.search_of(network).crops.points_of_draw == everywhere
+        assert config.search_of(network, at_places=True).crops.points_of_draw == many
+    given = DetectConfig(search=SearchConfig(crops=replace(CROPS, num_points=300)), many_points=True)
+    assert {given.search_of(network, at_places=places).crops.points_of_draw for places in (False, True)} == {300}

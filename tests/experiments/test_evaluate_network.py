@@ -17,6 +17,7 @@ from configs import find_config
 from experiments import evaluate_network, release
 from kmn_jax.errors import InputError
 from kmn_jax.models import create_model, load_model, load_pretrained, save_model
+from kmn_jax.released import RELEASED
 from tests.reference.networks import TINY
 
 pytestmark = pytest.mark.usefixtures("few_optimisations")
@@ -95,7 +96,7 @@ def test_the_released_model_does_what_its_card_says(tmp_path: Path) -> None:
 
 
 def test_a_model_that_was_never_released_is_refused() -> None:
-    with pytest.raises(InputError, match=r"there is no released model 'huge': there are wide"):
+    with pytest.raises(InputError, match=f"there is no released model 'huge': there are {RELEASED}"):
         load_pretrained("huge")
 
 

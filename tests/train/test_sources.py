@@ -14,6 +14,7 @@ from kmn_jax.data import Pack
 from kmn_jax.data._pack import write_manifest, write_object
 from kmn_jax.errors import InputError
 from kmn_jax.models import create_model, save_model, with_chiral_inputs
+from kmn_jax.released import RELEASED
 from kmn_jax.train._sources import trained_network, warm_parameters
 
 DEBUG = find_config("debug")
@@ -47,7 +48,7 @@ def test_a_warm_start_begins_with_the_weights_of_a_file(tmp_path: Path) -> None:
     for leaf, wanted in zip(jax.tree.leaves(found), jax.tree.leaves(model[1]), strict=True):
         np.testing.assert_array_equal(leaf, wanted)
     with pytest.raises(InputError, match="another network than the config's"):
-        warm_parameters(replace(DEBUG, warm_start="wide"))
+        warm_parameters(replace(DEBUG, warm_start=RELEASED))
     dynamic = replace(DEBUG.network, graph="dynamic")
     same = warm_parameters(replace(DEBUG, network=dynamic, warm_start=str(tmp_path / "some.safetensors")))
     assert jax.tree.all(jax.tree.map(np.array_equal, same, found))  # how neighbours are found has no parameters
