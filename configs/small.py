@@ -19,7 +19,7 @@ worlds
                begun with the 560,000 above.
 
 worlds_long
-    With the 1,024 points that a search draws.
+    With 1,024 points, as a search draws around places that are given.
     Command:   python -m experiments.train worlds_long
     Hardware:  one H200, 11 minutes beside other runs, 3 of them until the first step; 5,600 samples/s in the median,
                7,000 at best.

@@ -43,8 +43,8 @@ class SearchConfig:
     def of_network(self, config: KeyMatchNetConfig) -> SearchConfig:
         """Return the same with the number of points of a draw, unless it is given: that which it was trained with.
 
-        Of the many seeds of a scene, most of a copy's fail or succeed together; of a single one, more points find more,
-        see `CropSearchConfig.of_network`.
+        All over a scene several seeds lie on each copy, so that draws may be small; around a single point larger ones
+        find more, see `CropSearchConfig.of_network`.
         """
         return replace(self, crops=replace(self.crops, num_points=self.crops.num_points or config.num_scene_points))
 
