@@ -16,6 +16,12 @@ wide_long, dynamic_long
                dynamic_long, beside two other runs, 11 minutes at 4,200.
     Expected:  wide_long: validation loss 1.874, segmentation accuracy 0.969, keypoint accuracy 0.201 of 64;
                dynamic_long: 2.163, 0.960, 0.144; docs/training.md has the recalls.
+
+wide_longer
+    Goes on from the weights of wide_long.
+    Command:   python -m experiments.train wide_longer
+    Hardware:  one H200.
+    Expected:  not yet known.
 """
 
 from __future__ import annotations
@@ -76,4 +82,11 @@ def _long(of: TrainConfig, name: str) -> TrainConfig:
 LONG = (
     _long(_WIDE, "wide_long"),
     replace(_long(_DYNAMIC, "dynamic_long"), warm_start="experiments/assets/small.safetensors"),
+    replace(
+        _long(_WIDE, "wide_longer"),
+        warm_start="kmn_jax/pretrained/wide.safetensors",
+        num_steps=17_000,
+        validate_every=4_000,
+        checkpoint_every=2_000,
+    ),
 )
