@@ -84,7 +84,7 @@ LONG = (
     replace(_long(_DYNAMIC, "dynamic_long"), warm_start="experiments/assets/small.safetensors"),
     replace(
         _long(_WIDE, "wide_longer"),
-        warm_start="kmn_jax/pretrained/wide.safetensors",
+        warm_start="runs/wide_long/model.safetensors",
         num_steps=17_000,
         validate_every=4_000,
         checkpoint_every=2_000,

@@ -24,6 +24,7 @@ from kmn_jax.detection._evidence import PICTURE_EVIDENCE, gather_evidence, pictu
 from kmn_jax.detection._mapping import call_rows
 from kmn_jax.detection._result import CropPrediction
 from kmn_jax.detection._scene import Scene
+from kmn_jax.errors import require
 from kmn_jax.geometry import Crop, PaddedCloud
 from kmn_jax.models import KeyMatchNetConfig, Model
 from kmn_jax.objects import PartArrays
@@ -39,14 +40,20 @@ class SearchConfig:
 
     crops: CropSearchConfig = field(default_factory=CropSearchConfig)
     agreement: DepthAgreementConfig = field(default_factory=DepthAgreementConfig)
+    most_draws: int = 2  # around each seed, where a scene is searched all over
+
+    def __post_init__(self) -> None:
+        require(self.most_draws >= 1, f"most_draws = {self.most_draws} must be 1 or more")
 
     def of_network(self, config: KeyMatchNetConfig) -> SearchConfig:
-        """Return the same with the number of points of a draw, unless it is given: that which it was trained with.
+        """Return the same for a search all over a scene, where several seeds lie on each copy.
 
-        All over a scene several seeds lie on each copy, so that draws may be small; around a single point larger ones
-        find more, see `CropSearchConfig.of_network`.
+        So draws may be few, and small: of as many points as the network was trained with, unless it is given. Around a
+        single point more and larger ones find more, see `CropSearchConfig.of_network`.
         """
-        return replace(self, crops=replace(self.crops, num_points=self.crops.num_points or config.num_scene_points))
+        crops = self.crops
+        num_points, num_draws = crops.num_points or config.num_scene_points, min(crops.num_draws, self.most_draws)
+        return replace(self, crops=replace(crops, num_points=num_points, num_draws=num_draws))
 
 
 class Candidates(NamedTuple):

@@ -27,6 +27,7 @@ from kmn_jax.detection import (
     spread_seeds,
 )
 from kmn_jax.detection._search import _columns_of, no_poses
+from kmn_jax.errors import InputError
 from kmn_jax.geometry import PaddedCloud, spread_rows
 from kmn_jax.io import Scan
 from kmn_jax.models import Model, create_model, encode_object
@@ -189,13 +190,20 @@ def test_the_picture_shows_the_same_of_poses_that_were_kept(part: DevicePart, sc
 
 
 @pytest.mark.parametrize(("trained", "many"), [(512, 1024), (2048, 2048)])
-def test_draws_have_as_many_points_as_the_network_was_trained_with_or_more_where_they_are_few(
+def test_all_over_a_scene_draws_are_fewer_and_of_as_many_points_as_the_network_was_trained_with(
     trained: int, many: int
 ) -> None:
     network = replace(NETWORK, num_scene_points=trained)
-    for effort, everywhere in (("fast", trained), ("usual", trained), ("thorough", many)):
-        config = config_of(effort)
-        assert config.search_of(network).crops.points_of_draw == everywhere
-        assert config.search_of(network, at_places=True).crops.points_of_draw == many
+    efforts = (
+        ("fast", (1, trained), (1, many)),
+        ("usual", (2, trained), (4, many)),
+        ("thorough", (4, many), (4, many)),
+    )
+    for effort, everywhere, at_places in efforts:
+        for given, wanted in ((False, everywhere), (True, at_places)):
+            crops = config_of(effort).search_of(network, at_places=given).crops
+            assert (crops.num_draws, crops.points_of_draw) == wanted
     given = DetectConfig(search=SearchConfig(crops=replace(CROPS, num_points=300)), many_points=True)
     assert {given.search_of(network, at_places=places).crops.points_of_draw for places in (False, True)} == {300}
+    with pytest.raises(InputError, match="most_draws = 0"):
+        SearchConfig(most_draws=0)

@@ -22,14 +22,16 @@ from kmn_jax.pose import RIGHT, THRESHOLDS
 
 def test_settings_differ_in_what_their_names_say() -> None:
     assert SETTINGS[PLAIN] == DetectConfig()
-    numbers = {"one": 1, "two": 2, "eight": 8}
+    numbers = {"one": 1, "four": 4, "eight": 8}
     for name, config in SETTINGS.items():
-        crops = config.search.crops
+        search = config.search
         base = next((known for word, known in (("thorough", THOROUGH), ("fast", FAST)) if word in name), DetectConfig())
-        draws = [number for word, number in numbers.items() if f"{word} draw" in name] or [base.search.crops.num_draws]
+        draws = [number for word, number in numbers.items() if f"{word} draw" in name]
+        usual = base.search.crops.num_draws if base.many_points else base.search.most_draws
         points = [int(number.replace(",", "")) for number in re.findall(r"([\d,]+) points", name)]
         points = points or [base.search.crops.num_points]
-        assert (crops.num_draws, crops.num_points) == (draws[0], points[0])
+        most = search.crops.num_draws if base.many_points else search.most_draws
+        assert (most, search.crops.num_points) == ((draws or [usual])[0], points[0])
         patience = {"patience 4": 4, "all finely": None}.get(name.split(", ")[-1], base.patience)
         assert replace(config, search=base.search) == replace(base, patience=patience)
 
@@ -72,9 +74,9 @@ def test_copies_and_times_stand_beside_those_of_the_search_as_it_is(
     monkeypatch.setattr(search_curve, "world_images", lambda *_: [object()] * 4)
     monkeypatch.setattr(search_curve, "load_pretrained", lambda: None)
     monkeypatch.setattr(search_curve, "_searched", fake)
-    options = Options(settings=("two draws", PLAIN), json=tmp_path / "curve.json", picture=tmp_path / "curve.png")
+    options = Options(settings=("four draws", PLAIN), json=tmp_path / "curve.json", picture=tmp_path / "curve.png")
     one, plain = run(options)
-    assert searched.count(PLAIN) == searched.count("two draws") == 5  # the first of each compiles, and is not counted
+    assert searched.count(PLAIN) == searched.count("four draws") == 5  # the first of each compiles, and is not counted
     assert (one["recall"], plain["recall"]) == (0.5, 1.0)
     assert (one["copies"], one["images"], one["median s"], one["times as long"]) == (8, 4, 1.0, 0.5)
     wide = [row["difference of recall, 95%"] for row in (one, plain)]
@@ -102,7 +104,7 @@ def test_bad_input_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="no settings are called 'none': choose among fast"):
         run(Options(settings=("none", PLAIN)))
     with pytest.raises(InputError, match="'as it is', which others are compared with, is missing"):
-        run(Options(settings=("two draws",)))
+        run(Options(settings=("four draws",)))
     monkeypatch.setattr(search_curve, "world_images", lambda *_: [])
     with pytest.raises(InputError, match=r"no image of .* was searched"):
         run(Options(settings=(PLAIN,)))
