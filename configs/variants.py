@@ -9,8 +9,8 @@ variant_...
                (dynamic) and 2.33 (invariant); docs/training.md has the recalls. The others have not been run.
 
 wide_long, dynamic_long
-    The two that found more, trained for long: wide_long, whose weights are released as `wide`, from random parameters,
-    dynamic_long from those of `small`, as its parameters have the same shapes.
+    The two that found more, trained for long: wide_long from random parameters, dynamic_long from those of `small`, as
+    its parameters have the same shapes.
     Command:   python -m experiments.train wide_long, and the same with the other name
     Hardware:  one H200: wide_long alone 9 minutes, 3 of them until the first step, at 5,800 samples/s in the median;
                dynamic_long, beside two other runs, 11 minutes at 4,200.
@@ -18,10 +18,11 @@ wide_long, dynamic_long
                dynamic_long: 2.163, 0.960, 0.144; docs/training.md has the recalls.
 
 wide_longer
-    Goes on from the weights of wide_long.
-    Command:   python -m experiments.train wide_longer
-    Hardware:  one H200.
-    Expected:  not yet known.
+    Goes on from the weights of wide_long, and is released as `wide`.
+    Command:   python -m experiments.train wide_long
+               python -m experiments.train wide_longer
+    Hardware:  one H200 alone, 9 minutes, 2.5 of them until the first step, at 6,100 samples/s in the median.
+    Expected:  after 2,176,000 samples more: validation loss 1.802, segmentation accuracy 0.970, keypoint accuracy 0.217.
 """
 
 from __future__ import annotations

@@ -2,13 +2,15 @@
 
 The whole scan is given and nothing else. A pose is right if its ADI to a copy is below a tenth of the diameter and no
 more probable pose took that copy; recall counts the copies of which at least 30% is visible. In images without the
-part, and with `--strangers` for a part of about the same size in all images, whatever is accepted is wrong.
+part, and with `--strangers` for a part of about the same size in all images, whatever is accepted is wrong. Ctrl+C ends
+it with the images so far.
 """
 
 from __future__ import annotations
 
 import sys
 from collections import defaultdict
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -120,23 +122,24 @@ def run(options: Options) -> dict[str, Any]:
     fitted = load_probabilities(options.calibration, EVIDENCE)
     tallies: dict[str, WorldTally] = defaultdict(WorldTally)
     worst = WorstImages(CONFIG.accepted)
-    for image in tqdm(world_images(options.folder, model, options.every), unit="image"):
-        scan = scan_of(image, options.given)
-        if scan is None:
-            continue
-        scene, found = found_in(model, fitted, image.part, scan)
-        counted = Tally.of(image, found)
-        if options.worst is not None and scene is not None:
-            worst.add(image, scene, found, counted)
-        groups = [image.family, _ALL, *([] if image.family in _BUT else [_OTHERS])]
-        for name in groups:
-            tallies[name].add(image, counted)
-        if options.strangers and image.stranger is not None and len(image.truth):
-            _, found = found_in(model, fitted, image.stranger, scan)
+    with suppress(KeyboardInterrupt):
+        for image in tqdm(world_images(options.folder, model, options.every), unit="image"):
+            scan = scan_of(image, options.given)
+            if scan is None:
+                continue
+            scene, found = found_in(model, fitted, image.part, scan)
+            counted = Tally.of(image, found)
+            if options.worst is not None and scene is not None:
+                worst.add(image, scene, found, counted)
+            groups = [image.family, _ALL, *([] if image.family in _BUT else [_OTHERS])]
             for name in groups:
-                tallies[name].add_stranger(found)
+                tallies[name].add(image, counted)
+            if options.strangers and image.stranger is not None and len(image.truth):
+                _, found = found_in(model, fitted, image.stranger, scan)
+                for name in groups:
+                    tallies[name].add_stranger(found)
     if not tallies:
-        raise InputError(f"{options.folder} holds no images")
+        raise InputError(f"no image of {options.folder} was searched: it holds none, or Ctrl+C came too soon")
     rows = [tally.row(name) for name, tally in tallies.items()]
     print_table("Detection in world bins", rows)
     curves = {

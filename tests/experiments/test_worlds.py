@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from experiments import detect_worlds
 from experiments.bins import LEAST_VISIBLE, WorldImage, world_images
 from experiments.candidates import as_given
 from experiments.detect_bins import Tally
@@ -140,6 +142,26 @@ def test_counts(images: list[WorldImage]) -> None:
     assert row["average precision"] == pytest.approx(seen * (100 // copies + 1) / 101)
     assert row["shifted, mm, median"] == pytest.approx(0, abs=1e-3)
     assert row["turned, degrees, 90%"] == pytest.approx(0, abs=0.1)
+
+
+def test_what_was_searched_before_an_interruption_counts(
+    images: list[WorldImage], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def some(count: int) -> Callable[..., Iterator[WorldImage]]:
+        def images_then_interrupted(*_: object) -> Iterator[WorldImage]:
+            yield from images[:count]
+            raise KeyboardInterrupt
+
+        return images_then_interrupted
+
+    nothing = Detections("part", "mm", (), Timing({"search": 1.0}, 0.0), "nothing was found")
+    monkeypatch.setattr(detect_worlds, "found_in", lambda *_: (None, nothing))
+    monkeypatch.setattr(detect_worlds, "world_images", some(2))
+    rows = detect_worlds.run(detect_worlds.Options())["detection"]
+    assert {row["bins"]: row["images"] for row in rows} == {"mixed parts": 2, "all": 2} | {detect_worlds._OTHERS: 2}
+    monkeypatch.setattr(detect_worlds, "world_images", some(0))
+    with pytest.raises(InputError, match=r"no image .* was searched"):
+        detect_worlds.run(detect_worlds.Options())
 
 
 def test_the_worst_images_are_drawn(images: list[WorldImage], tmp_path: Path) -> None:
