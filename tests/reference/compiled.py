@@ -11,7 +11,7 @@ from pathlib import Path
 
 _MOST_KEPT = 1e9  # bytes
 _PLAIN_LOOPS = "--xla_cpu_use_fusion_emitters=false"
-_LESS_OPTIMISED = "--xla_backend_optimization_level=1"
+_LESS_OPTIMISED = "--xla_backend_optimization_level=0"
 _IN_ONE_PIECE = "--xla_cpu_parallel_codegen_split_count=1"
 
 
