@@ -39,7 +39,7 @@ from kmn_jax.models import Model, load_pretrained, released_scene
 from kmn_jax.objects import ObjectModel, PartArrays, arrays_of, make_part
 
 _SMALL_SET = Path("experiments/assets/small_test_set")
-SEARCH = CropSearchConfig()  # what users run
+SEARCH = CropSearchConfig()  # what users run around a place that is given
 
 
 class Stage(NamedTuple):
@@ -135,7 +135,7 @@ def pose_stages(config: CropSearchConfig = SEARCH) -> dict[str, Stage]:
     draw = network_call(model.parameters, part, drawn)
     poses_call = compile_for(lambda s, v, p, k: poses_of_draw(s, v, p, k, config), draw, crop.valid, part, key).function
     poses = poses_call(draw, crop.valid, part, key)
-    draws = jax.tree.map(lambda leaf: jnp.stack([leaf] * config.num_draws), draw)
+    draws = jax.tree.map(lambda leaf: jnp.stack([leaf] * config.most_draws), draw)
     scores_call = compile_for(lambda f, s, c, p: surface_scores(f, s, c, p, config), poses, draws, crop.seed, part)
     searched = jax.jit(lambda c: search_draws(nnx.merge(*model), part, c, key, config))(crop)
     made = int(searched.num_draws)
@@ -152,7 +152,7 @@ def pose_stages(config: CropSearchConfig = SEARCH) -> dict[str, Stage]:
         "crop to refined poses, all draws": lambda: find_poses_in_crop(*model, part, crop, key, every),
         "crop to refined poses": lambda: poses_at(model, part, cloud, 0, 0, config),
     }
-    kept = max(config.num_draws * (count - 1) + 1, config.crop_points)
+    kept = max(config.most_draws * (count - 1) + 1, config.crop_points)
     pairs = min(config.matches.capacity, count * sizes.num_keypoints)
     search = work.matches(count, sizes.num_keypoints, config.matches) + work.ransac(
         pairs, config.num_modes, config.ransac
@@ -163,7 +163,7 @@ def pose_stages(config: CropSearchConfig = SEARCH) -> dict[str, Stage]:
         "network on a draw": work.total(work.scene_stages(sizes, count).values()),
         "matches and RANSAC of a draw": search,
         "a draw's poses against the surface": work.surface_scores(
-            config.num_modes, config.surface_points, config.num_draws * count
+            config.num_modes, config.surface_points, config.most_draws * count
         ),
         "ICP": work.icp(len(part.points), config.icp_points, config.icp),
     }
@@ -173,7 +173,7 @@ def pose_stages(config: CropSearchConfig = SEARCH) -> dict[str, Stage]:
         calls,
         of_stage
         | {
-            "crop to refined poses, all draws": first + draw_work.times(config.num_draws) + last,
+            "crop to refined poses, all draws": first + draw_work.times(config.most_draws) + last,
             "crop to refined poses": first + draw_work.times(made) + last,
         },
     )

@@ -1,4 +1,4 @@
-"""Networks beside `small`, all trained alike: from random parameters, in worlds, with as many samples.
+"""Networks beside `small`; the variants are all trained alike: from random parameters, in worlds, as many samples.
 
 variant_reference is `small` itself; every other one differs from it by what its name says.
 

@@ -9,9 +9,9 @@ printed. The model of poses as they are found is fitted first: it chooses which 
 detection. Of refined poses detection reports one for each place: the one that a third model holds for the most
 probable, which is fitted to whether all points are in their places (MSSD), and not their mean (ADI). Models are too
 sure of themselves about kinds of objects that they were not fitted to: so the scales of the refined poses' models are
-fitted to what detection would report by models that do not know the kind, of searches in vain to the share of them that
-world bins have (--absent-share): how probable poses are depends on it. From the same poses, of scans of which is known
-where parts are, a fourth model learns what poses of one scene say about each other.
+fitted to what detection would report by models that do not know the kind. Among that, searches in vain have the share
+that they have in world bins (--absent-share): how probable poses are depends on it. From the same poses, of scans of
+which is known where parts are, a fourth model learns what poses of one scene say about each other.
 """
 
 from __future__ import annotations

@@ -122,6 +122,7 @@ def run(options: Options) -> dict[str, Any]:
     fitted = load_probabilities(options.calibration, EVIDENCE)
     tallies: dict[str, WorldTally] = defaultdict(WorldTally)
     worst = WorstImages(CONFIG.accepted)
+    stopped = True
     with suppress(KeyboardInterrupt):
         for image in tqdm(world_images(options.folder, model, options.every), unit="image"):
             scan = scan_of(image, options.given)
@@ -138,7 +139,8 @@ def run(options: Options) -> dict[str, Any]:
                 _, found = found_in(model, fitted, image.stranger, scan)
                 for name in groups:
                     tallies[name].add_stranger(found)
-    if not tallies:
+        stopped = False
+    if _ALL not in tallies:
         raise InputError(f"no image of {options.folder} was searched: it holds none, or Ctrl+C came too soon")
     rows = [tally.row(name) for name, tally in tallies.items()]
     print_table("Detection in world bins", rows)
@@ -148,7 +150,9 @@ def run(options: Options) -> dict[str, Any]:
         if name != _OTHERS
     }
     print_table("Reliability over all", curves[_ALL])
-    results = {"detection": rows, "reliability": curves}
+    if stopped:
+        print("stopped before the last image: families that come later are missing, also in what is told of all")
+    results = {"detection": rows, "reliability": curves} | ({"stopped": True} if stopped else {})
     write_json(options.json, results)
     save_reliability(curves, options.picture)
     if options.worst is not None:

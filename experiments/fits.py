@@ -34,7 +34,7 @@ class FitOptions:
     folds: int = 5
     members: int = 3  # fits, whose mean is the model of refined poses
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
-    absent_share: float = 0.25  # of the searches that scales are fitted to: so many scans of worlds lack the part
+    absent_share: float = 0.25  # of the searches that scales are fitted to: so many scans of world bins lack the part
 
     def __post_init__(self) -> None:
         require(0 <= self.absent_share < 1, f"absent_share = {self.absent_share} must be a share below 1")
@@ -46,10 +46,11 @@ def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def in_proportion(poses: dict[str, np.ndarray], options: FitOptions) -> dict[str, np.ndarray]:
-    """Return poses of which fewer are those that detection reports: searches in vain have their share, and no more.
+    """Return the poses with `reported` cleared in some searches in vain, so that these have the share that is meant.
 
-    Parts that are not there are searched more often than they would be, to learn from them what to refuse. How probable
-    a pose is depends on how often the part is there at all: so scales are fitted to as many such searches as are meant.
+    Parts that are not there are searched more often than they would be, to learn from them what to refuse. But how
+    probable a pose is depends on how often the part is there at all, so scales must not be fitted to all of these
+    searches. Searches of parts that the network knows, of which nothing is reported, do not count.
     """
     judged = np.isin(poses["object"], poses["object"][poses["reported"]])
     there = np.unique(poses["search"][judged & np.isfinite(poses["error"])])

@@ -45,7 +45,7 @@ SETTINGS = {
     "fast, patience 4": replace(FAST, patience=4),
     "fast, all finely": replace(FAST, patience=None),
     PLAIN: _USUAL,
-    "four draws": replace(_USUAL, search=replace(_USUAL.search, most_draws=4)),
+    "four draws": _with_crops(_USUAL, num_draws=4),
     "1,024 points a draw": _with_crops(_USUAL, num_points=1024),
     "thorough": THOROUGH,
     "thorough, 2,048 points a draw": _with_crops(THOROUGH, num_points=2048),

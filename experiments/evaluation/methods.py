@@ -46,7 +46,7 @@ ONE_RANSAC = CropSearchConfig(
 
 @dataclass(frozen=True)
 class Ours:
-    """Our network, and the pose search that users run; or another one over the matches of the first draw."""
+    """Our network and pose search, as users run it at given places; or another one over the first draw's matches."""
 
     name: str
     model: Model
@@ -59,7 +59,7 @@ class Ours:
         """The network's sizes, its weights' digest, and the sizes of the search."""
         own = {
             "weights": model_digest(self.model),
-            "search": asdict(self.config),
+            "search": asdict(self.config.of_network(self.model.config)),
             "num_keypoints": self.num_keypoints,
         }
         if self.search is not None:

@@ -47,7 +47,8 @@ from kmn_jax.typing import PRNGKey, Scalar
 
 _NORMAL_RADIUS = 0.06  # diameters, of normals without smoothing
 _LEAST_POINTS = 16  # a crop of fewer is not valid
-_LEAST_DRAWN = 1024  # points of a draw
+_LEAST_DRAWN = 1024  # points of a draw, ...
+_MOST_DRAWS = 4  # ... around a place that is given
 _COMPARED = 32  # points of the surface by which poses are told apart
 
 _Draws = TypeVar("_Draws")
@@ -57,7 +58,7 @@ _Draws = TypeVar("_Draws")
 class CropSearchConfig:
     """How poses are found in a crop; lengths are shares of the object's diameter."""
 
-    num_draws: int = 4  # of points that the network sees, at most
+    num_draws: int | None = None  # of points that the network sees, at most; 4 unless given, see `of_network`
     enough: float | None = 0.7  # of a pose's surface score, -1 to 3: then no more draws are made; None: all are made
     give_up: bool = False  # no more draws where the first one has no pose: a few copies fewer, in turn far less time
     side_by_side: bool | None = None  # all draws at once; None: unless JAX runs on a CPU
@@ -78,17 +79,26 @@ class CropSearchConfig:
 
     def __post_init__(self) -> None:
         for name in ("num_draws", "num_modes", "num_poses", "surface_points", "icp_points"):
-            if getattr(self, name) < 1:
+            if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)} must be 1 or more")
         if self.enough is not None and not abs(self.enough) < float("inf"):
             raise InputError(f"enough = {self.enough} must be finite; None makes all draws")
 
     def of_network(self, config: KeyMatchNetConfig) -> CropSearchConfig:
-        """Return the same with the number of points of a draw, unless it is given.
+        """Return the same with the numbers of draws and of their points, unless they are given.
 
-        It is that which the network was trained with, or more: one of 512 finds more in 1,024 (experiments/RESULTS.md).
+        A draw has as many points as the network was trained with, or more: one of 512 finds more in 1,024
+        (experiments/RESULTS.md). All over a scene draws are fewer and smaller, see `SearchConfig.of_network`.
         """
-        return replace(self, num_points=self.num_points or max(config.num_scene_points, _LEAST_DRAWN))
+        num_points = self.num_points or max(config.num_scene_points, _LEAST_DRAWN)
+        return replace(self, num_points=num_points, num_draws=self.num_draws or _MOST_DRAWS)
+
+    @property
+    def most_draws(self) -> int:
+        """How many draws there are at most. Raises InputError if it is not known, see `of_network`."""
+        if self.num_draws is None:
+            raise InputError("num_draws is not given: take the config's of_network(model.config)")
+        return self.num_draws
 
     @property
     def points_of_draw(self) -> int:
@@ -145,7 +155,7 @@ def search_crop(
 ) -> Crop:
     """Return the crop of a cloud, around the point in a row, as `poses_in_crop` takes it."""
     num_points = config.points_of_draw
-    count = max(config.num_draws * (num_points - 1) + 1, config.crop_points)
+    count = max(config.most_draws * (num_points - 1) + 1, config.crop_points)
     return crop_around(key, cloud, jnp.asarray(seed_row), diameter, count, min(_LEAST_POINTS, num_points))
 
 
@@ -198,7 +208,7 @@ def search_draws(
     One after the other, or, as on accelerators, all side by side: that takes little longer than one there, and nothing
     waits for a score. Those that would not have been made are forgotten.
     """
-    keys = jax.random.split(key, config.num_draws)
+    keys = jax.random.split(key, config.most_draws)
 
     def one(draw: Int[Array, ""]) -> tuple[Prediction, PoseResult]:
         prediction = predict(network, part, draw_of_crop(crop, draw, part.diameter, config))
@@ -223,7 +233,7 @@ def draws_in_turn(
     """
 
     def more(state: DrawsSearch) -> Bool[Array, ""]:
-        wanted = valid & (state.num_draws < config.num_draws) & is_unsure(state.scores.max(), config)
+        wanted = valid & (state.num_draws < config.most_draws) & is_unsure(state.scores.max(), config)
         return (state.num_draws == 0) | wanted
 
     def scored_by(count: int) -> Callable[[PoseResult, Prediction], Float[Array, " h"]]:
@@ -233,14 +243,14 @@ def draws_in_turn(
         draw, new = state.num_draws, one(state.num_draws)
         made: Any = jax.tree.map(lambda leaf, new: leaf.at[draw].set(new), (state.predictions, state.poses), new)
         # Draws that are still to be made have no points, but would take as long to compare with.
-        scores = jax.lax.switch(draw, [scored_by(1 + row) for row in range(config.num_draws)], new[1], made[0])
+        scores = jax.lax.switch(draw, [scored_by(1 + row) for row in range(config.most_draws)], new[1], made[0])
         return DrawsSearch(draw + 1, made[0], made[1], state.scores.at[draw].set(scores))
 
     def none(leaf: jax.ShapeDtypeStruct) -> Array:
-        return jnp.zeros((config.num_draws, *leaf.shape), leaf.dtype)
+        return jnp.zeros((config.most_draws, *leaf.shape), leaf.dtype)
 
     nothing: Any = jax.tree.map(none, jax.eval_shape(one, jnp.int32(0)))
-    scores = jnp.full((config.num_draws, config.num_modes), -jnp.inf)
+    scores = jnp.full((config.most_draws, config.num_modes), -jnp.inf)
     return jax.lax.while_loop(more, make, DrawsSearch(jnp.int32(0), nothing[0], nothing[1], scores))
 
 
@@ -251,7 +261,7 @@ def draws_side_by_side(
     config: CropSearchConfig,
 ) -> DrawsSearch:
     """Make all draws at once, and return what `draws_in_turn` does, up to rounding."""
-    draws = jnp.arange(config.num_draws, dtype=jnp.int32)
+    draws = jnp.arange(config.most_draws, dtype=jnp.int32)
     predictions, poses = jax.vmap(one)(draws)
     scores = jax.vmap(lambda draw, found: scored(found, _first(predictions, draw + 1)))(draws, poses)
     number = draws_needed(scores, valid, config)
@@ -262,7 +272,7 @@ def draws_side_by_side(
 def draws_needed(scores: Float[Array, "d h"], valid: Bool[Array, ""], config: CropSearchConfig) -> Int[Array, ""]:
     """Return how many draws of such scores are made one after the other."""
     unsure = jax.lax.cummin(is_unsure(jax.lax.cummax(scores.max(axis=1)), config).astype(jnp.int32))
-    number = jnp.minimum(unsure.sum(dtype=jnp.int32) + 1, config.num_draws)
+    number = jnp.minimum(unsure.sum(dtype=jnp.int32) + 1, config.most_draws)
     return jnp.where(valid, number, 1)
 
 
@@ -289,9 +299,9 @@ def draw_of_crop(crop: Crop, draw: Int[ArrayLike, ""], diameter: Scalar, config:
     Draws share only the seed, unless the points are too few for that: each gets as many as it has room for.
     """
     others = config.points_of_draw - 1
-    slots = max(config.num_draws * others, 1)  # of all draws, which lie evenly over the points
+    slots = max(config.most_draws * others, 1)  # of all draws, which lie evenly over the points
     total = jnp.maximum(crop.mask.sum(dtype=jnp.int32) - 1, others)
-    slot = jnp.arange(others, dtype=jnp.int32) * config.num_draws + jnp.asarray(draw, dtype=jnp.int32)
+    slot = jnp.arange(others, dtype=jnp.int32) * config.most_draws + jnp.asarray(draw, dtype=jnp.int32)
     rows = jnp.concatenate([jnp.zeros(1, jnp.int32), 1 + even_rows(slot, total, slots)])
     mask = crop.mask[rows]
     points = jnp.where(mask[:, None], crop.points[rows], 0)

@@ -24,7 +24,6 @@ from kmn_jax.detection._evidence import PICTURE_EVIDENCE, gather_evidence, pictu
 from kmn_jax.detection._mapping import call_rows
 from kmn_jax.detection._result import CropPrediction
 from kmn_jax.detection._scene import Scene
-from kmn_jax.errors import require
 from kmn_jax.geometry import Crop, PaddedCloud
 from kmn_jax.models import KeyMatchNetConfig, Model
 from kmn_jax.objects import PartArrays
@@ -32,6 +31,7 @@ from kmn_jax.pose import PoseResult
 from kmn_jax.typing import PRNGKey
 
 _KEYS = 128  # that are made at once
+_MOST_DRAWS = 2  # around each seed, where a scene is searched all over
 
 
 @dataclass(frozen=True)
@@ -40,19 +40,15 @@ class SearchConfig:
 
     crops: CropSearchConfig = field(default_factory=CropSearchConfig)
     agreement: DepthAgreementConfig = field(default_factory=DepthAgreementConfig)
-    most_draws: int = 2  # around each seed, where a scene is searched all over
-
-    def __post_init__(self) -> None:
-        require(self.most_draws >= 1, f"most_draws = {self.most_draws} must be 1 or more")
 
     def of_network(self, config: KeyMatchNetConfig) -> SearchConfig:
-        """Return the same for a search all over a scene, where several seeds lie on each copy.
+        """Return the same for a search all over a scene, with the numbers of draws and of their points, unless given.
 
-        So draws may be few, and small: of as many points as the network was trained with, unless it is given. Around a
-        single point more and larger ones find more, see `CropSearchConfig.of_network`.
+        Several seeds lie on each copy there, so that draws may be few, and small: of as many points as the network was
+        trained with. Around a single point more and larger ones find more, see `CropSearchConfig.of_network`.
         """
         crops = self.crops
-        num_points, num_draws = crops.num_points or config.num_scene_points, min(crops.num_draws, self.most_draws)
+        num_points, num_draws = crops.num_points or config.num_scene_points, crops.num_draws or _MOST_DRAWS
         return replace(self, crops=replace(crops, num_points=num_points, num_draws=num_draws))
 
 

@@ -205,5 +205,7 @@ def test_all_over_a_scene_draws_are_fewer_and_of_as_many_points_as_the_network_w
             assert (crops.num_draws, crops.points_of_draw) == wanted
     given = DetectConfig(search=SearchConfig(crops=replace(CROPS, num_points=300)), many_points=True)
     assert {given.search_of(network, at_places=places).crops.points_of_draw for places in (False, True)} == {300}
-    with pytest.raises(InputError, match="most_draws = 0"):
-        SearchConfig(most_draws=0)
+    more = DetectConfig(search=SearchConfig(crops=CropSearchConfig(num_draws=7)))
+    assert {more.search_of(network, at_places=places).crops.most_draws for places in (False, True)} == {7}
+    with pytest.raises(InputError, match="num_draws is not given"):
+        _ = CropSearchConfig().most_draws
