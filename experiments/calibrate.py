@@ -9,9 +9,8 @@ printed. The model of poses as they are found is fitted first: it chooses which 
 detection. Of refined poses detection reports one for each place: the one that a third model holds for the most
 probable, which is fitted to whether all points are in their places (MSSD), and not their mean (ADI). Models are too
 sure of themselves about kinds of objects that they were not fitted to: so the scales of the refined poses' models are
-fitted to what detection would report by models that do not know the kind. Among that, searches in vain have the share
-that they have in world bins (--absent-share): how probable poses are depends on it. From the same poses, of scans of
-which is known where parts are, a fourth model learns what poses of one scene say about each other.
+fitted to what detection would report by models that do not know the kind. From the same poses, of scans of which is
+known where parts are, a fourth model learns what poses of one scene say about each other.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from typing import Annotated, Any
 import tyro
 
 from experiments.candidates import Sources, poses_to_fit
-from experiments.fits import FitOptions, by_largest_error, fit, fit_together, in_proportion
+from experiments.fits import FitOptions, by_largest_error, fit, fit_together
 from experiments.reliability_picture import save_reliability
 from kmn_jax.detection import Probabilities, calibration_beside, load_lightgbm, probabilities_bytes
 from kmn_jax.errors import InputError
@@ -58,7 +57,7 @@ def calibrate(options: Options) -> dict[str, Any]:
         check_target(target)
     load_lightgbm()  # before an hour of searching, not after
     network = load_pretrained() if options.model is None else load_model(options.model)
-    poses = in_proportion(poses_to_fit(options, options, network, options.candidates), options)
+    poses = poses_to_fit(options, options, network, options.candidates)
     refined = {column: values[poses["refined"]] for column, values in poses.items()}
     found = {column: values[~poses["refined"]] for column, values in poses.items()}
     fitted = {

@@ -22,7 +22,7 @@ from kmn_jax.detection import (
     fit_logistic,
     vouched,
 )
-from kmn_jax.errors import InputError, require
+from kmn_jax.errors import InputError
 
 _SCALE_RIDGE = 1e-4  # hardly any: it makes probabilities too modest
 
@@ -34,30 +34,11 @@ class FitOptions:
     folds: int = 5
     members: int = 3  # fits, whose mean is the model of refined poses
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
-    absent_share: float = 0.25  # of the searches that scales are fitted to: so many scans of world bins lack the part
-
-    def __post_init__(self) -> None:
-        require(0 <= self.absent_share < 1, f"absent_share = {self.absent_share} must be a share below 1")
 
 
 def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return poses that are right if all of their points are."""
     return poses | {"error": poses["largest_error"]}
-
-
-def in_proportion(poses: dict[str, np.ndarray], options: FitOptions) -> dict[str, np.ndarray]:
-    """Return the poses with `reported` cleared in some searches in vain, so that these have the share that is meant.
-
-    Parts that are not there are searched more often than they would be, to learn from them what to refuse. But how
-    probable a pose is depends on how often the part is there at all, so scales must not be fitted to all of these
-    searches. Searches of parts that the network knows, of which nothing is reported, do not count.
-    """
-    judged = np.isin(poses["object"], poses["object"][poses["reported"]])
-    there = np.unique(poses["search"][judged & np.isfinite(poses["error"])])
-    in_vain = np.setdiff1d(poses["search"][judged], there)
-    most = min(len(in_vain), round(options.absent_share / (1 - options.absent_share) * len(there)))
-    left = in_vain[np.arange(most) * len(in_vain) // max(most, 1)]
-    return poses | {"reported": poses["reported"] & np.isin(poses["search"], np.append(there, left))}
 
 
 def held_out_models(

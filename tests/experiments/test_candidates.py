@@ -23,7 +23,6 @@ from kmn_jax.detection import (
     DetectConfig,
     DevicePart,
     chosen,
-    load_probabilities,
 )
 from kmn_jax.errors import InputError
 from kmn_jax.models import Model, create_model, load_pretrained
@@ -182,37 +181,6 @@ def test_poses_of_other_bins_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no poses to judge anew"):
         calibrate(Options(candidates=tmp_path / "none.npz", output=output, judge_anew=True))
     assert not output.exists()
-
-
-def test_searches_in_vain_have_their_share_in_what_is_judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(0)
-    searches, each = 80, 5  # every second search is in vain; all poses are there as they are found, and refined
-    search = np.tile(np.repeat(np.arange(searches), each), 2)
-    in_vain = search % 2 == 1
-    right = ~in_vain & (rng.random(search.size) < 0.6)
-    error = np.where(in_vain, np.inf, np.where(right, 0.01, 0.5))
-    refined = np.arange(search.size) >= search.size // 2
-    poses = {
-        "evidence": (right[:, None] + 6 * rng.normal(size=(search.size, len(EVIDENCE)))).astype(np.float32),
-        "error": error,
-        "largest_error": error,
-        "object": search // 8,
-        "search": search,
-        "narrowed": np.ones(search.size, dtype=bool),
-        "refined": refined,
-        "reported": refined,
-    }
-    monkeypatch.setattr("experiments.calibrate.poses_to_fit", lambda *_: poses)
-    monkeypatch.setattr("experiments.calibrate.load_pretrained", lambda: None)
-    said = {}
-    for share, in_vain_left in ((0.2, 10), (0.5, 40)):
-        output = tmp_path / f"{share}.json"
-        results = calibrate(Options(output=output, absent_share=share, folds=2, members=1))
-        for name in ("refined", "exact", "together"):
-            assert results[name]["summary"]["poses"] == each * (searches // 2 + in_vain_left)
-        assert results["found"]["summary"]["poses"] == each * searches
-        said[share] = load_probabilities(output, EVIDENCE).refined.probability(poses["evidence"]).mean()
-    assert said[0.2] > said[0.5] + 0.02
 
 
 def test_another_method_does_not_replace_what_is_shipped() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments import fits
-from experiments.fits import FitOptions, fit, fit_together, in_proportion
+from experiments.fits import FitOptions, fit, fit_together
 from kmn_jax.detection import expected_calibration_error, vouched
 from kmn_jax.errors import InputError
 
@@ -91,29 +91,6 @@ def test_absent_parts_count_more_among_refined_poses() -> None:
     found = drawn(0) | {"reported": np.zeros(_OBJECTS * _POSES, dtype=bool)}
     found["refined"] = ~found["refined"]
     np.testing.assert_array_equal(fitted(found, 20), fitted(found, 1))
-
-
-def test_searches_in_vain_are_judged_in_their_share() -> None:
-    # Of 40 searches every second one is in vain; each has two poses, of which one is reported. The last ten are of
-    # kinds that are not judged.
-    search = np.repeat(np.arange(40), 2)
-    in_vain = search % 2 == 1
-    poses = {
-        "error": np.where(in_vain, np.inf, np.tile([0.01, 0.5], 40)),
-        "object": np.where(search < 30, search // 10, 100),
-        "search": search,
-        "reported": np.tile([True, False], 40) & (search < 30),
-    }
-    for share, left in ((0.25, 5), (0.4, 10), (0.9, 15), (0.0, 0)):
-        found = in_proportion(poses, FitOptions(absent_share=share))
-        assert (found["reported"] & in_vain).sum() == left
-        np.testing.assert_array_equal(found["reported"][~in_vain], poses["reported"][~in_vain])
-        assert all(found[name] is poses[name] for name in ("error", "object", "search"))
-    some = in_proportion(poses, FitOptions(absent_share=0.25))
-    assert np.ptp(search[some["reported"] & in_vain]) > 20  # spread over all
-    for share in (-0.1, 1.0, float("nan")):
-        with pytest.raises(InputError, match="absent_share"):
-            FitOptions(absent_share=share)
 
 
 def test_an_object_with_four_times_the_poses_counts_twice() -> None:
