@@ -57,13 +57,13 @@ def forget_what_was_compiled() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def few_optimisations() -> Iterator[None]:
-    """Compile what runs for moments only without LLVM's expensive passes: it is slower, and rounds otherwise."""
+    """Compile in half of the time what runs for moments only: programs are slower, and round otherwise."""
     yield from _compiling_with(few=True)
 
 
 @pytest.fixture
 def all_optimisations(few_optimisations: None) -> Iterator[None]:
-    """Compile as in other files: with few optimisations each use of a value may be rounded otherwise."""
+    """Compile with what else is left out in this file: without, each use of a value may be rounded otherwise."""
     yield from _compiling_with(few=False)
 
 

@@ -31,7 +31,7 @@ ASSETS = Path(experiments.__file__).parent / "assets"
 IMAGE = max((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))
 OnDevice = tuple[DevicePart, CalibrationArrays]
 Seen = tuple[DepthImage, jax.Array, np.ndarray]
-CONFIG = BinPosesConfig(num_seeds=32, search=SearchConfig(CropSearchConfig(num_points=512)))
+CONFIG = BinPosesConfig(num_seeds=32, search=SearchConfig(CropSearchConfig(num_points=512, num_draws=4)))
 FLOOR_MARGIN = 3.0  # mm
 
 
