@@ -24,12 +24,12 @@ def test_settings_differ_in_what_their_names_say() -> None:
     assert SETTINGS[PLAIN] == DetectConfig()
     numbers = {"four": 4, "eight": 8}
     for name, config in SETTINGS.items():
-        search = config.search
+        crops = config.search.crops
         base = next((known for word, known in (("thorough", THOROUGH), ("fast", FAST)) if word in name), DetectConfig())
         draws = [number for word, number in numbers.items() if f"{word} draw" in name] or [base.search.crops.num_draws]
         points = [int(number.replace(",", "")) for number in re.findall(r"([\d,]+) points", name)]
         points = points or [base.search.crops.num_points]
-        assert (search.crops.num_draws, search.crops.num_points) == (draws[0], points[0])
+        assert (crops.num_draws, crops.num_points) == (draws[0], points[0])
         patience = {"patience 4": 4, "all finely": None}.get(name.split(", ")[-1], base.patience)
         assert replace(config, search=base.search) == replace(base, patience=patience)
 
