@@ -20,20 +20,11 @@ from kmn_jax.detection._canonical import canonical_pose
 from kmn_jax.detection._coverage import near_surface
 from kmn_jax.detection._crop_search import (
     CropPoses,
-    CropSearchConfig,
-    Draw,
     DrawsSearch,
-    Prediction,
-    draw_of_crop,
     find_poses_in_crop,
-    matches_of,
     poses_in_crop,
-    poses_of_draw,
-    predict,
-    refined,
     search_crop,
     search_draws,
-    surface_scores,
 )
 from kmn_jax.detection._depth_agreement import (
     DepthAgreement,
@@ -56,6 +47,17 @@ from kmn_jax.detection._detect import (
     reported,
 )
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place, symmetry_transforms
+from kmn_jax.detection._draw import (
+    CropSearchConfig,
+    Draw,
+    Prediction,
+    draw_of_crop,
+    matches_of,
+    poses_of_draw,
+    predict,
+    refined,
+    surface_scores,
+)
 from kmn_jax.detection._estimator import PoseEstimator
 from kmn_jax.detection._evidence import EVIDENCE, PICTURE_EVIDENCE, gather_evidence
 from kmn_jax.detection._export import export_estimator

@@ -14,8 +14,9 @@ from jaxtyping import Float, Int
 from kmn_jax.detection._calibration import Calibration, Probabilities
 from kmn_jax.detection._canonical import canonical_pose
 from kmn_jax.detection._coverage import cover, nothing_covered, to_search, unexplained
-from kmn_jax.detection._crop_search import CropPoses, CropSearchConfig
+from kmn_jax.detection._crop_search import CropPoses
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place
+from kmn_jax.detection._draw import CropSearchConfig
 from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
 from kmn_jax.detection._frames import placed
 from kmn_jax.detection._mapping import call_rows

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from kmn_jax.detection._crop_search import CropPoses, Prediction
+from kmn_jax.detection._crop_search import CropPoses
 from kmn_jax.detection._depth_agreement import DepthAgreement, DepthAgreementConfig, DepthImage, depth_agreement
+from kmn_jax.detection._draw import Prediction
 from kmn_jax.detection._mapping import map_real
 from kmn_jax.detection._picture_agreement import PictureAgreement, picture_agreement
 from kmn_jax.detection._surroundings import Surroundings, surroundings

@@ -11,15 +11,10 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, ArrayLike, Bool, Float, Float32, Int, UInt32
 
-from kmn_jax.detection._crop_search import (
-    CropPoses,
-    CropSearchConfig,
-    Prediction,
-    crop_of_scene,
-    find_poses_in_crop,
-)
+from kmn_jax.detection._crop_search import CropPoses, crop_of_scene, find_poses_in_crop
 from kmn_jax.detection._depth_agreement import DepthAgreementConfig, DepthImage
 from kmn_jax.detection._device_part import DevicePart
+from kmn_jax.detection._draw import CropSearchConfig, Prediction
 from kmn_jax.detection._evidence import PICTURE_EVIDENCE, gather_evidence, picture_columns
 from kmn_jax.detection._mapping import call_rows
 from kmn_jax.detection._result import CropPrediction
