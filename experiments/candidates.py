@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from itertools import count
 from pathlib import Path
@@ -13,7 +14,7 @@ from zipfile import BadZipFile
 
 import jax
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32, Int
 from tqdm import tqdm
 
 from experiments.bins import TrueImage, WorldImage, bin_images, world_images
@@ -24,13 +25,16 @@ from kmn_jax.detection import (
     EVIDENCE,
     PICTURE_EVIDENCE,
     TREE_SETTINGS,
+    Calibration,
     Candidates,
+    Clock,
     DetectConfig,
     DevicePart,
     Scene,
     SearchConfig,
     chosen,
     device_part,
+    explore,
     make_scene,
     picture_evidence,
     refined_candidates,
@@ -53,6 +57,7 @@ _COLUMNS = (  # of what is stored
     "narrowed",
     "T_camera_object",
     "refined",
+    "due",  # whether they are of what detection chooses among, which refines less; of parts that are not known
     "reported",
 )
 _MARGINS = (0.1, 0.4)  # diameters: so much of what is around copies is left in scans that are cut out
@@ -104,13 +109,6 @@ class Search(NamedTuple):
         return measure(self.scene.T_scene_camera @ T_camera_object).min(axis=1, initial=np.inf)
 
 
-class _Searched(NamedTuple):
-    """What choosing among the poses of a search wants."""
-
-    on_device: DevicePart
-    is_known: bool
-
-
 def poses_to_fit(
     sources: Sources, fits: FitOptions, network: Model, stored: Path | None = None
 ) -> dict[str, np.ndarray]:
@@ -158,27 +156,50 @@ def _read(stored: Path, made_of: str) -> dict[str, np.ndarray]:
 
 
 def collect(sources: Sources, fits: FitOptions, network: Model) -> dict[str, np.ndarray]:
-    """Search and refine. Images are read twice, as they do not all fit into memory."""
+    """Search and refine.
+
+    First around the seeds that detection begins with, which the model of poses as they are found is fitted to. Then,
+    by such models that do not know the object, as detection does, round after round: where little is found most is
+    wrong. Of parts that the network knows, no scale is fitted to which, only what was found first is refined. Images
+    are read twice, as they do not all fit into memory.
+    """
     config = DetectConfig().search_of(network.config)
-    proposed, parts = [], []
+    known, parts = [], []
     for search in _searches(sources, network):
-        found = _proposed(search, network, config, sources.method)
+        found = _propose(search, network, config, sources.method)(_first_seeds(search))
         parts.append(search.columns(found))
-        proposed.append(_with_poses(found))
+        if search.is_known:
+            known.append(_with_poses(found))
     poses = _joined(parts)
     none = np.zeros(len(poses["error"]), dtype=bool)
-    poses |= {"refined": none, "reported": none}
-    chooser = model_of(poses, fits)
+    poses |= {"refined": none, "due": none, "reported": none}
+    others, all_known = _models(poses, fits), model_of(poses, fits)
     parts, searched = [], {}
-    for search, found in zip(_searches(sources, network), proposed, strict=True):
+    for search in _searches(sources, network):
+        if search.is_known:
+            found, chooser = known.pop(0), all_known
+        else:
+            chooser = others[search.number]
+            found = _explored(search, _propose(search, network, config, sources.method), chooser)
         choice = chosen(found, chooser, search.on_device, _LOOSE)
         rows = np.flatnonzero(choice.kept | choice.contenders)
         if len(rows):
-            searched[search.row] = _Searched(search.on_device, search.is_known)
-            parts.append(search.columns(refined_candidates(search.on_device, search.scene, found, rows, 0, config)))
+            searched[search.row] = search.on_device
+            fine = refined_candidates(search.on_device, search.scene, found, rows, 0, config)
+            due = _due(found, chooser, search.on_device, rows, fine) & (not search.is_known)
+            parts.append(search.columns(fine) | {"due": due})
     fine = _joined(parts)
     none = np.zeros(len(fine["error"]), dtype=bool)
     return _with_reported(_joined([poses, fine | {"refined": ~none, "reported": none}]), searched, fits)
+
+
+def _due(
+    found: Candidates, chooser: Calibration, on_device: DevicePart, rows: Int[np.ndarray, " k"], fine: Candidates
+) -> Bool[np.ndarray, " s"]:
+    """Return of the poses that some candidates, in `rows`, became whether detection refines these candidates."""
+    choice = chosen(found, chooser, on_device, DetectConfig())
+    due = (choice.kept | choice.contenders)[rows]
+    return np.tile(due, len(fine.usable) // len(rows))[fine.usable]
 
 
 def judged_anew(
@@ -197,7 +218,7 @@ def judged_anew(
     for search in _searches(sources, network):
         rows = np.flatnonzero(poses["search"] == search.row)
         if len(rows):
-            searched[search.row] = _Searched(search.on_device, search.is_known)
+            searched[search.row] = search.on_device
             found = poses["T_camera_object"][rows]
             _check(bool((poses["object"][rows] == search.number).all()))
             _check(np.allclose(search.errors(found[:1], search.image.errors), poses["error"][rows[:1]], atol=1e-4))
@@ -213,22 +234,24 @@ def _check(is_same: bool) -> None:
 
 
 def _with_reported(
-    poses: dict[str, np.ndarray], searched: dict[int, _Searched], fits: FitOptions
+    poses: dict[str, np.ndarray], searched: dict[int, DevicePart], fits: FitOptions
 ) -> dict[str, np.ndarray]:
     """Return poses with what detection reports of each search, by models that do not know its object."""
     fine = {name: values[poses["refined"]] for name, values in poses.items()}
-    others, exact = (
-        {name: fitted for names, fitted in held_out_models(rows, fits) for name in names}
-        for rows in (fine, by_largest_error(fine))
-    )
+    others, exact = (_models(rows, fits) for rows in (fine, by_largest_error(fine)))
     reported = np.zeros(len(poses["error"]), dtype=bool)
-    for row, (on_device, is_known) in searched.items():
-        rows = np.flatnonzero((poses["search"] == row) & poses["refined"])
-        if len(rows) and not is_known:
+    for row, on_device in searched.items():
+        rows = np.flatnonzero((poses["search"] == row) & poses["due"])
+        if len(rows):
             number = int(poses["object"][rows[0]])
             found = _choosable(poses["T_camera_object"][rows], poses["evidence"][rows])
             reported[rows] = chosen(found, others[number], on_device, DetectConfig(), exact[number]).kept
     return poses | {"reported": reported}
+
+
+def _models(poses: dict[str, np.ndarray], fits: FitOptions) -> dict[int, Calibration]:
+    """Return for each object the model that is fitted to the poses of others."""
+    return {int(name): fitted for names, fitted in held_out_models(poses, fits) for name in names}
 
 
 def _choosable(poses: Float32[np.ndarray, "s 4 4"], evidence: Float32[np.ndarray, "s f"]) -> Candidates:
@@ -281,12 +304,24 @@ def as_given(image: WorldImage, row: int) -> Scan:
     return cut if cut is not None and len(cut.points) else image.cloud()
 
 
-def _proposed(search: Search, network: Model, config: SearchConfig, method: str) -> Candidates:
-    """Return the poses in crops around the seeds of a detection's first round."""
-    rows = seeds_over(search.scene, search.scene.foreground, search.image.part)
+def _first_seeds(search: Search) -> Int[np.ndarray, " c"]:
+    return seeds_over(search.scene, search.scene.foreground, search.image.part)
+
+
+def _propose(
+    search: Search, network: Model, config: SearchConfig, method: str
+) -> Callable[[Int[np.ndarray, " c"]], Candidates]:
+    """Return what finds the poses in crops around seeds."""
     if method == "FPFH":
-        return fpfh_poses(search.part, search.on_device, search.scene, rows)
-    return search_at(network, search.on_device, search.scene, rows, 0, config)
+        return partial(fpfh_poses, search.part, search.on_device, search.scene)
+    return lambda rows: search_at(network, search.on_device, search.scene, rows, 0, config)
+
+
+def _explored(
+    search: Search, propose: Callable[[Int[np.ndarray, " c"]], Candidates], chooser: Calibration
+) -> Candidates:
+    """Return the poses that detection finds in all of its rounds."""
+    return explore(search.scene, search.part, propose, chooser, DetectConfig(), Clock())[0]
 
 
 def _with_poses(found: Candidates) -> Candidates:
