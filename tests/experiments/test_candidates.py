@@ -60,9 +60,7 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
     def searches(sources: Sources, network: Any) -> Any:
         for row in range(2):
             image = SimpleNamespace(errors=None)
-            yield SimpleNamespace(
-                row=row, on_device=row, scene=row, is_known=row == 1, number=7 + row, image=image, errors=errors
-            )
+            yield SimpleNamespace(row=row, on_device=row, scene=row, number=7 + row, image=image, errors=errors)
 
     def errors(poses: np.ndarray, measure: Any) -> np.ndarray:
         return np.full(len(poses), 0.01)
@@ -107,6 +105,7 @@ def store(path: Path, network: Model, names: tuple[str, ...] = EVIDENCE, **other
         "narrowed": np.zeros(6, dtype=bool),
         "T_camera_object": poses,
         "refined": np.array([False, True, True, True, True, True]),
+        "due": np.array([False, True, True, True, False, False]),
         "reported": np.zeros(6, dtype=bool),
     }
     np.savez(path, **stored | others)
@@ -130,7 +129,7 @@ def test_stored_poses_are_judged_anew_by_other_evidence(
         else:
             wanted = np.full(6, names.index(name))
         np.testing.assert_array_equal(column, wanted)
-    # Of refined poses, those that are chosen; none of parts that the network knows.
+    # Of refined poses that detection chooses among, those that are chosen.
     np.testing.assert_array_equal(poses["reported"], [False, False, True, True, False, False])
     with np.load(path) as stored:  # nothing is lost that another day's evidence may want
         assert set(stored["names"].tolist()) == {*EVIDENCE, "what is gone"}
@@ -181,6 +180,75 @@ def test_poses_of_other_bins_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no poses to judge anew"):
         calibrate(Options(candidates=tmp_path / "none.npz", output=output, judge_anew=True))
     assert not output.exists()
+
+
+def test_what_detection_refines_is_told_of_all_forms(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of six candidates four are refined, of which detection, which is stricter, refines two; one form is missing."""
+    rows, forms = np.array([0, 2, 3, 5]), 3
+    usable = np.ones(len(rows) * forms, dtype=bool)
+    usable[5] = False  # the second form of the second candidate
+
+    def stricter(found: None, model: None, part: None, config: DetectConfig) -> Any:
+        assert config == DetectConfig()
+        kept, contenders = np.zeros((2, 6), dtype=bool)
+        kept[[1, 2]], contenders[5] = True, True
+        return SimpleNamespace(kept=kept, contenders=contenders)
+
+    monkeypatch.setattr(module, "chosen", stricter)
+    nothing: Any = None
+    fine: Any = SimpleNamespace(usable=usable)
+    due = module._due(nothing, nothing, nothing, rows, fine)
+    np.testing.assert_array_equal(due, [False, True, False, True] + [False, False, True] + [False, True, False, True])
+
+
+def test_unknown_parts_are_searched_as_detection_does_and_known_ones_at_first_seeds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A search of an unknown part is explored with the model that does not know it, one of a known part is not."""
+    poses = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
+
+    def searches(sources: Sources, network: Any) -> Any:
+        for row, is_known in enumerate((False, False, True)):
+
+            def columns(found: Any, row: int = row) -> dict[str, np.ndarray]:
+                count = len(found.usable)
+                numbers = {"object": 7 + row, "search": row, "error": 0.01, "largest_error": 0.01, "narrowed": False}
+                rows = {name: np.full(count, value) for name, value in numbers.items()}
+                evidence = np.full((count, len(EVIDENCE)), found.evidence[0])
+                return rows | {"evidence": evidence, "T_camera_object": poses[:count]}
+
+            yield SimpleNamespace(
+                row=row, on_device=row, scene=row, is_known=is_known, number=7 + row, columns=columns
+            )
+
+    def found(count: int, evidence: float) -> Any:
+        return SimpleNamespace(usable=np.ones(count, dtype=bool), evidence=np.array([evidence]))
+
+    chosen_by = []
+
+    def all_of(found: Any, model: Any, part: int, config: Any, exact: Any = None) -> Any:
+        chosen_by.append((part, model))
+        count = len(found.usable)
+        return SimpleNamespace(kept=np.ones(count, dtype=bool), contenders=np.zeros(count, dtype=bool))
+
+    monkeypatch.setattr(module, "_searches", searches)
+    monkeypatch.setattr(module, "_first_seeds", lambda search: None)
+    monkeypatch.setattr(module, "_propose", lambda *given: lambda rows: found(1, 0.0))
+    monkeypatch.setattr(module, "_explored", lambda search, propose, model: found(2, 10.0 + model))
+    monkeypatch.setattr(module, "_with_poses", lambda found: found)
+    monkeypatch.setattr(module, "_models", lambda poses, fits: {7: 1, 8: 2, 9: 3})
+    monkeypatch.setattr(module, "model_of", lambda poses, fits: "all")
+    monkeypatch.setattr(module, "chosen", all_of)
+    monkeypatch.setattr(module, "refined_candidates", lambda part, scene, found, *_: found)
+    network: Any = SimpleNamespace(config=TINY)
+    result = module.collect(Sources(), FitOptions(), network)
+    refined = result["refined"]
+    np.testing.assert_array_equal(result["search"][~refined], [0, 1, 2])
+    np.testing.assert_array_equal(result["search"][refined], [0, 0, 1, 1, 2])
+    np.testing.assert_array_equal(result["evidence"][refined, 0], [11, 11, 12, 12, 0])
+    np.testing.assert_array_equal(result["due"][refined], [True, True, True, True, False])
+    np.testing.assert_array_equal(result["reported"], result["due"])
+    assert chosen_by[:5] == [(0, 1), (0, 1), (1, 2), (1, 2), (2, "all")]
 
 
 def test_another_method_does_not_replace_what_is_shipped() -> None:
