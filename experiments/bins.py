@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float32
 
 from experiments.made_data import require_made
 from experiments.test_sets import SPLIT
-from experiments.worlds import NAMES, TARGETS, kind_of
+from experiments.worlds import NAMES, TARGETS, has_other_parts, kind_of
 from kmn_jax.bop import BopDataset, BopFrame, BopInstance, FrameKey
 from kmn_jax.data import load_models
 from kmn_jax.detection import Scene, bin_content, make_scene, near_surface, symmetry_transforms
@@ -38,7 +38,7 @@ class TrueImage:
 
     key: FrameKey
     part: Part
-    stranger: Part | None  # a part of about the same size of which there is no copy
+    stranger: Part | None  # a part of about the same size of which there is no copy, where that is known
     truth: Float[np.ndarray, "i 4 4"]
     visible: Float[np.ndarray, " i"]  # share of each copy that is seen
 
@@ -160,11 +160,13 @@ def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldIm
             )
         part = parts[object_id]
         frame = dataset.frame(*key, masks=True).with_visibility()
+        instances = frame.instances or ()
+        others = [other for number, other in parts.items() if kinds[number] != kinds[object_id]]
         yield WorldImage(
             key,
             part,
-            _like_in_size(part, [other for number, other in parts.items() if kinds[number] != kinds[object_id]]),
-            *_truth(frame.instances or ()),
+            None if has_other_parts(family, len(instances)) else _like_in_size(part, others),
+            *_truth(instances),
             family,
             numbers[kinds[object_id]],
             _scan(frame),

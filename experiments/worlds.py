@@ -141,6 +141,11 @@ def kind_of(name: str) -> str:
     return name.rpartition("_")[0]
 
 
+def has_other_parts(family: str, copies: int) -> bool:
+    """Tell whether other parts, of about the same size, may lie in an image of so many copies; they have no poses."""
+    return copies == 0 or any(one.others[1] for one in FAMILIES if one.name == family)
+
+
 def _write_family(folder: Path, scene_id: int, recipe: Recipe, paths: list[Path]) -> None:
     """Write the images of a family of worlds, and which part is asked for in each."""
     family = recipe.families[scene_id - 1]
