@@ -73,15 +73,22 @@ def test_parts_in_rows_touch_nothing_but_each_other(folder: Path) -> None:
 
 def test_images_come_with_their_scans(folder: Path, model: Model, images: list[WorldImage]) -> None:
     assert [image.family for image in images] == ["mixed parts"] * 4 + ["touching rows"] * 4
-    first = images[0]
-    assert first.stranger is not None
+    first, in_rows = images[0], images[4]
+    assert in_rows.stranger is not None
     names = json.loads((folder / "models" / "object_names.json").read_text())
-    numbers = [str(int(part.name.removeprefix("obj_"))) for part in (first.part, first.stranger)]
+    numbers = [str(int(part.name.removeprefix("obj_"))) for part in (in_rows.part, in_rows.stranger)]
     assert {kind_of(names[number]) for number in numbers} == {"washer", "lever"}
     assert len(first.scan.points) == (first.scan.depth > 0).sum()  # type: ignore[operator]
     assert first.errors(first.truth).argmin(axis=1).tolist() == list(range(len(first.truth)))
     with pytest.raises(InputError, match="build_data worlds"):
         next(world_images(folder / "models", model))
+
+
+def test_no_stranger_is_searched_where_it_may_lie(images: list[WorldImage]) -> None:
+    """Other parts of an image, which are those nearest in size, have no poses: a stranger may be one of them."""
+    for image in images:
+        others = image.family == "mixed parts" or not len(image.truth)
+        assert (image.stranger is None) == others
 
 
 def test_scans_are_cut_out_around_copies(images: list[WorldImage]) -> None:
