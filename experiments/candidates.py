@@ -61,6 +61,7 @@ _COLUMNS = (  # of what is stored
     "reported",
 )
 _MARGINS = (0.1, 0.4)  # diameters: so much of what is around copies is left in scans that are cut out
+_HOW = 2  # version of how is collected: it goes up with what is searched, of what and from where
 _KINDS = 100  # more than the families of parts in a folder of world bins
 
 
@@ -159,38 +160,40 @@ def collect(sources: Sources, fits: FitOptions, network: Model) -> dict[str, np.
     """Search and refine.
 
     First around the seeds that detection begins with, which the model of poses as they are found is fitted to. Then,
-    by such models that do not know the object, as detection does, round after round: where little is found most is
-    wrong. Of parts that the network knows, no scale is fitted to which, only what was found first is refined. Images
+    by such models that do not know the image's object, as detection does, round after round: where little is found most
+    is wrong. Of parts that the network knows, no scale is fitted to which, only what was found first is refined. Images
     are read twice, as they do not all fit into memory.
     """
     config = DetectConfig().search_of(network.config)
-    known, parts = [], []
+    known: dict[int, Candidates] = {}
+    parts = []
     for search in _searches(sources, network):
         found = _propose(search, network, config, sources.method)(_first_seeds(search))
         parts.append(search.columns(found))
         if search.is_known:
-            known.append(_with_poses(found))
+            known[search.row] = _with_poses(found)
     poses = _joined(parts)
     none = np.zeros(len(poses["error"]), dtype=bool)
     poses |= {"refined": none, "due": none, "reported": none}
-    others, all_known = _models(poses, fits), model_of(poses, fits)
+    others, of_all = _models(poses, fits), model_of(poses, fits)
     parts, searched = [], {}
     for search in _searches(sources, network):
         if search.is_known:
-            found, chooser = known.pop(0), all_known
+            found, chooser = known.pop(search.row), of_all
         else:
-            chooser = others[search.number]
+            chooser = others.get(search.number, of_all)  # of an object without poses no model knows anything
             found = _explored(search, _propose(search, network, config, sources.method), chooser)
         choice = chosen(found, chooser, search.on_device, _LOOSE)
         rows = np.flatnonzero(choice.kept | choice.contenders)
         if len(rows):
             searched[search.row] = search.on_device
             fine = refined_candidates(search.on_device, search.scene, found, rows, 0, config)
-            due = _due(found, chooser, search.on_device, rows, fine) & (not search.is_known)
+            none = np.zeros(np.count_nonzero(fine.usable), dtype=bool)
+            due = none if search.is_known else _due(found, chooser, search.on_device, rows, fine)
             parts.append(search.columns(fine) | {"due": due})
-    fine = _joined(parts)
-    none = np.zeros(len(fine["error"]), dtype=bool)
-    return _with_reported(_joined([poses, fine | {"refined": ~none, "reported": none}]), searched, fits)
+    more = _joined(parts)
+    none = np.zeros(len(more["error"]), dtype=bool)
+    return _with_reported(_joined([poses, more | {"refined": ~none, "reported": none}]), searched, fits)
 
 
 def _due(
@@ -236,7 +239,7 @@ def _check(is_same: bool) -> None:
 def _with_reported(
     poses: dict[str, np.ndarray], searched: dict[int, DevicePart], fits: FitOptions
 ) -> dict[str, np.ndarray]:
-    """Return poses with what detection reports of each search, by models that do not know its object."""
+    """Return poses with what detection reports of each search, by models that do not know the image's object."""
     fine = {name: values[poses["refined"]] for name, values in poses.items()}
     others, exact = (_models(rows, fits) for rows in (fine, by_largest_error(fine)))
     reported = np.zeros(len(poses["error"]), dtype=bool)
@@ -265,7 +268,7 @@ def _joined(columns: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def _searches(sources: Sources, network: Model) -> Iterator[Search]:
-    """Yield all images with their parts, and every second one with a part that is not there."""
+    """Yield all images with their parts, and every second one with a part that is known not to be there, if any is."""
     searches = count()
     for row, (number, image, scene, is_known) in enumerate(_images(sources, network)):
         for part in (image.part, image.stranger if row % 2 == 0 else None):
@@ -305,7 +308,7 @@ def as_given(image: WorldImage, row: int) -> Scan:
 
 
 def _first_seeds(search: Search) -> Int[np.ndarray, " c"]:
-    return seeds_over(search.scene, search.scene.foreground, search.image.part)
+    return seeds_over(search.scene, search.scene.foreground, search.part)
 
 
 def _propose(
@@ -342,6 +345,6 @@ def _with_poses(found: Candidates) -> Candidates:
 def _made_of(sources: Sources, fits: FitOptions, network: Model) -> str:
     """Say what candidates are made of."""
     folders = [str(folder) for folder in (sources.bins, sources.worlds, sources.known_worlds)]
-    settings = DetectConfig().search_of(network.config)
+    settings = DetectConfig(), DetectConfig().search_of(network.config), _LOOSE, _MARGINS
     decisive = fits.folds, fits.members, fits.absent_weight, TREE_SETTINGS  # for what is reported
-    return repr((sources.method, folders, sources.every, decisive, model_digest(network), settings, _MARGINS))
+    return repr((_HOW, sources.method, folders, sources.every, decisive, model_digest(network), settings))

@@ -198,7 +198,7 @@ def test_what_detection_refines_is_told_of_all_forms(monkeypatch: pytest.MonkeyP
     nothing: Any = None
     fine: Any = SimpleNamespace(usable=usable)
     due = module._due(nothing, nothing, nothing, rows, fine)
-    np.testing.assert_array_equal(due, [False, True, False, True] + [False, False, True] + [False, True, False, True])
+    np.testing.assert_array_equal(due, [False, True, False, True, False, False, True, False, True, False, True])
 
 
 def test_unknown_parts_are_searched_as_detection_does_and_known_ones_at_first_seeds(
@@ -217,9 +217,7 @@ def test_unknown_parts_are_searched_as_detection_does_and_known_ones_at_first_se
                 evidence = np.full((count, len(EVIDENCE)), found.evidence[0])
                 return rows | {"evidence": evidence, "T_camera_object": poses[:count]}
 
-            yield SimpleNamespace(
-                row=row, on_device=row, scene=row, is_known=is_known, number=7 + row, columns=columns
-            )
+            yield SimpleNamespace(row=row, on_device=row, scene=row, is_known=is_known, number=7 + row, columns=columns)
 
     def found(count: int, evidence: float) -> Any:
         return SimpleNamespace(usable=np.ones(count, dtype=bool), evidence=np.array([evidence]))
@@ -236,8 +234,10 @@ def test_unknown_parts_are_searched_as_detection_does_and_known_ones_at_first_se
     monkeypatch.setattr(module, "_propose", lambda *given: lambda rows: found(1, 0.0))
     monkeypatch.setattr(module, "_explored", lambda search, propose, model: found(2, 10.0 + model))
     monkeypatch.setattr(module, "_with_poses", lambda found: found)
-    monkeypatch.setattr(module, "_models", lambda poses, fits: {7: 1, 8: 2, 9: 3})
-    monkeypatch.setattr(module, "model_of", lambda poses, fits: "all")
+    of_found, of_refined = {7: 1, 9: 3}, {7: 1, 8: 2, 9: 3}  # 8 has no pose around the first seeds
+    models = {False: of_found, True: of_refined}
+    monkeypatch.setattr(module, "_models", lambda poses, fits: models[bool(poses["refined"].all())])
+    monkeypatch.setattr(module, "model_of", lambda poses, fits: 5)
     monkeypatch.setattr(module, "chosen", all_of)
     monkeypatch.setattr(module, "refined_candidates", lambda part, scene, found, *_: found)
     network: Any = SimpleNamespace(config=TINY)
@@ -245,10 +245,35 @@ def test_unknown_parts_are_searched_as_detection_does_and_known_ones_at_first_se
     refined = result["refined"]
     np.testing.assert_array_equal(result["search"][~refined], [0, 1, 2])
     np.testing.assert_array_equal(result["search"][refined], [0, 0, 1, 1, 2])
-    np.testing.assert_array_equal(result["evidence"][refined, 0], [11, 11, 12, 12, 0])
+    np.testing.assert_array_equal(result["evidence"][refined, 0], [11, 11, 15, 15, 0])
     np.testing.assert_array_equal(result["due"][refined], [True, True, True, True, False])
     np.testing.assert_array_equal(result["reported"], result["due"])
-    assert chosen_by[:5] == [(0, 1), (0, 1), (1, 2), (1, 2), (2, "all")]
+    assert chosen_by[:5] == [(0, 1), (0, 1), (1, 5), (1, 5), (2, 5)]
+
+
+@pytest.mark.parametrize("method", ["kmn_jax", "FPFH"])
+def test_a_search_is_explored_as_by_detection(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
+    asked: list[Any] = []
+
+    def explore(scene: Any, part: Any, propose: Any, model: Any, config: DetectConfig, clock: Any) -> Any:
+        asked.append((scene, part, model, config))
+        return propose("rows"), ("a warning",)
+
+    monkeypatch.setattr(module, "explore", explore)
+    monkeypatch.setattr(module, "search_at", lambda *given: given)
+    monkeypatch.setattr(module, "fpfh_poses", lambda *given: given)
+    monkeypatch.setattr(module, "seeds_over", lambda scene, free, part: (scene, free, part))
+    scene = SimpleNamespace(foreground="foreground")
+    search: Any = SimpleNamespace(part="stranger", on_device="on device", scene=scene)
+    named: Any = {"network": "network", "config": "config", "chooser": "chooser"}
+    propose = module._propose(search, named["network"], named["config"], method)
+    wanted = {
+        "kmn_jax": ("network", "on device", scene, "rows", 0, "config"),
+        "FPFH": ("stranger", "on device", scene, "rows"),
+    }
+    assert module._explored(search, propose, named["chooser"]) == wanted[method]
+    assert asked == [(scene, "stranger", "chooser", DetectConfig())]
+    assert module._first_seeds(search) == (scene, "foreground", "stranger")
 
 
 def test_another_method_does_not_replace_what_is_shipped() -> None:

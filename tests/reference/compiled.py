@@ -11,7 +11,7 @@ from pathlib import Path
 
 _MOST_KEPT = 1e9  # bytes
 _PLAIN_LOOPS = "--xla_cpu_use_fusion_emitters=false"
-_LESS_OPTIMISED = "--xla_backend_optimization_level=0"
+_LESS_OPTIMISED = "--xla_backend_optimization_level=1"
 _IN_ONE_PIECE = "--xla_cpu_parallel_codegen_split_count=1"
 
 
@@ -19,7 +19,7 @@ def quick_flags() -> str:
     """Return XLA_FLAGS with which compiling for CPUs takes less than half of the time; flags that are given stay.
 
     Fused loops are made without MLIR, as in users' searches, LLVM optimises less, and no program is cut into pieces for
-    several threads, as pytest's workers keep all cores busy; programs are hardly slower. XLA ends a process for a flag
+    several threads, as pytest's workers keep all cores busy; programs are about as fast. XLA ends a process for a flag
     that it does not know, so versions that are not known to have them go without.
     """
     flags = os.environ.get("XLA_FLAGS", "")
