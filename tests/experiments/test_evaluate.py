@@ -92,6 +92,11 @@ def test_a_package_that_is_missing_or_broken_is_told_in_a_line(tmp_path: Path, m
     assert missing("broken_rival") == "broken_rival cannot be imported (libX.so: cannot open)"
 
 
+def no_pictures(*_: Any) -> dict[str, Any]:
+    """Draw nothing: for pictures a whole bin is searched, which takes long."""
+    return {}
+
+
 def test_evaluating_twice_gives_the_same_numbers_and_a_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -100,7 +105,7 @@ def test_evaluating_twice_gives_the_same_numbers_and_a_report(
     scores = []
     for folder in ("one", "two", "two"):
         assert evaluate.main(["demo", *options, "--output", str(tmp_path / folder)]) == 0
-        monkeypatch.setattr(evaluate, "draw_pictures", lambda *_: {})  # the first ones tell all, and take long
+        monkeypatch.setattr(evaluate, "draw_pictures", no_pictures)  # the first ones tell all
         content = json.loads((tmp_path / folder / "scores.json").read_text())
         scores.append([{key: cell[key] for key in ("method", "noise", "crops", "recall")} for cell in content["cells"]])
     assert scores[1] == scores[2]
@@ -212,6 +217,7 @@ def test_an_ablation_changes_one_choice_at_a_time(tmp_path: Path, monkeypatch: p
         base = single if key.startswith("one_RANSAC") else plain
         number = 0 if key in ("ours", "one_RANSAC") else 2 * (1 + key.count("keypoints_normals"))
         assert len(base.items() ^ leaves(method.settings).items()) == number, key
+    monkeypatch.setattr(evaluate, "draw_pictures", no_pictures)
     monkeypatch.setattr(ablate, "VARIANTS", {})
     monkeypatch.setattr(ablate, "SINGLE", {})
     monkeypatch.setattr(ablate, "KEYPOINTS", {"10 keypoints": 10})
@@ -239,6 +245,7 @@ def leaves(settings: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
 
 
 def test_rivals_are_tuned_by_settings_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evaluate, "draw_pictures", no_pictures)
     monkeypatch.setattr(tune_rivals, "_VOXELS", {"fpfh": ((0.05,), (0.05,)), "kiss": ((0.03,), (0.03,))})
     monkeypatch.setattr(rivals, "_SMOOTHED", (1024, 2048))  # of which each is compiled
     options = ["demo", "--objects", GEAR, "--images", "1", "--crops", "2", "--output", str(tmp_path / "out")]
