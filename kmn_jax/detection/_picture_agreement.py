@@ -33,6 +33,7 @@ _PLANE, _PLANE_ALIKE = 0.015, 0.9  # of what lies in one plane
 _REACH = 3  # cells over which a plane is fitted
 _BELOW, _RAISED = 0.02, 0.5  # the plane around an object: so far below it is all below, so high at most counts
 _NO_RELIEF = 1e-3  # diameters: with less, a surface is as good as flat
+_SMALL, _WIDE = 1, 3  # cells: the reach of windows, 3 and 7 cells wide
 _HIGHEST = jax.lax.Precision.HIGHEST
 
 
@@ -46,6 +47,8 @@ class PictureAgreement(NamedTuple):
     tight: Scalar  # measured within 1% of the diameter
     near: Scalar  # within 2%
     behind: Scalar  # farther than that
+    behind_in_3: Scalar  # the same of the 3 by 3 cells with most of it: a part that sticks out of another one's
+    behind_in_7: Scalar  # picture, as the handle of a mug that is none, is little of its own
     aligned: Scalar  # of what is measured about where it should be: the normal is as it should be
     turned: Scalar  # of the same: the normal is quite another
     with_normal: Scalar  # measured densely enough for a normal
@@ -121,10 +124,13 @@ def picture_agreement(T_camera_object: Pose, surfels: Surfels, image: DepthImage
     cosine = (seen.normals * found.normals).sum(axis=-1)
     compared = loose & found.has_normal
     small = loose & (jnp.abs(gap) < _LOOSE)
+    behind = mask & there & (gap > _TIGHT) & ~tight
     return PictureAgreement(
         tight=share(tight),
         near=share(near),
-        behind=share(there & (gap > _TIGHT) & ~tight),
+        behind=share(behind),
+        behind_in_3=_densest(behind, _SMALL),
+        behind_in_7=_densest(behind, _WIDE),
         aligned=share(cosine > _ALIKE, compared),
         turned=share(cosine < _TURNED, compared),
         with_normal=share(found.has_normal),
@@ -138,6 +144,11 @@ def picture_agreement(T_camera_object: Pose, surfels: Surfels, image: DepthImage
         **_relief(seen, found, small, diameter),
         **_outline(seen, found, compared, diameter),
     )
+
+
+def _densest(cells: Bool[Array, "s s"], reach: int) -> Scalar:
+    """Return the share of cells in the square window that has most of them."""
+    return summed(cells.astype(jnp.float32)[..., None], reach).max() / (2 * reach + 1) ** 2
 
 
 def _predicted(T_camera_object: Pose, surfels: Surfels, image: DepthImage) -> _Predicted:
