@@ -33,7 +33,7 @@ _PLANE, _PLANE_ALIKE = 0.015, 0.9  # of what lies in one plane
 _REACH = 3  # cells over which a plane is fitted
 _BELOW, _RAISED = 0.02, 0.5  # the plane around an object: so far below it is all below, so high at most counts
 _NO_RELIEF = 1e-3  # diameters: with less, a surface is as good as flat
-_SMALL, _WIDE = 1, 3  # cells: the reach of windows, 3 and 7 cells wide
+_NARROW, _WIDE = 1, 3  # cells: the reach of windows, 3 and 7 cells wide
 _HIGHEST = jax.lax.Precision.HIGHEST
 
 
@@ -41,14 +41,16 @@ class PictureAgreement(NamedTuple):
     """Shares of the cells of an object's picture, then of its outline; the outline is what is two cells away from it.
 
     Holes have an outline, too. Cells of the picture outside of the image count as not measured, those of the outline
-    are left out.
+    are left out. A piece that is not there, such as the handle of a mug, is few cells of the picture: so those that are
+    seen through are also counted in the square window that has most of them, as shares of all of its cells, of which
+    some may lie beyond the picture.
     """
 
     tight: Scalar  # measured within 1% of the diameter
     near: Scalar  # within 2%
-    behind: Scalar  # farther than that
-    behind_in_3: Scalar  # the same of the 3 by 3 cells with most of it: a part that sticks out of another one's
-    behind_in_7: Scalar  # picture, as the handle of a mug that is none, is little of its own
+    behind: Scalar  # seen through: farther than the surface by more than 1%
+    behind_in_3: Scalar  # the same of the 3 by 3 cells where it is most
+    behind_in_7: Scalar  # of 7 by 7 cells
     aligned: Scalar  # of what is measured about where it should be: the normal is as it should be
     turned: Scalar  # of the same: the normal is quite another
     with_normal: Scalar  # measured densely enough for a normal
@@ -129,7 +131,7 @@ def picture_agreement(T_camera_object: Pose, surfels: Surfels, image: DepthImage
         tight=share(tight),
         near=share(near),
         behind=share(behind),
-        behind_in_3=_densest(behind, _SMALL),
+        behind_in_3=_densest(behind, _NARROW),
         behind_in_7=_densest(behind, _WIDE),
         aligned=share(cosine > _ALIKE, compared),
         turned=share(cosine < _TURNED, compared),
@@ -147,7 +149,7 @@ def picture_agreement(T_camera_object: Pose, surfels: Surfels, image: DepthImage
 
 
 def _densest(cells: Bool[Array, "s s"], reach: int) -> Scalar:
-    """Return the share of cells in the square window that has most of them."""
+    """Return the share of a square window that such cells are, in the one that has most of them."""
     return summed(cells.astype(jnp.float32)[..., None], reach).max() / (2 * reach + 1) ** 2
 
 

@@ -124,30 +124,33 @@ def test_a_sparse_image_of_a_wall_is_still_level(depth: jax.Array) -> None:
     assert found.level > 0.95
 
 
-def test_a_corner_that_is_seen_through_counts_where_it_is(depth: jax.Array) -> None:
+def test_what_is_seen_through_counts_where_it_is_most() -> None:
     camera, diameter, T = intrinsics(CAMERA), jnp.float32(2**0.5), jnp.asarray(pose((0.0, 0.0, 3.0)), jnp.float32)
     rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
     x, y = (
         (place - center) / focal * 3
         for place, center, focal in ((columns, CAMERA.cx, CAMERA.fx), (rows, CAMERA.cy, CAMERA.fy))
     )
+    cell = 1 / 31  # of the plate's 32, of which the outer ones have their middles on its edges
 
-    def without(size: float, at: float = 0.0) -> PictureAgreement:
-        hole = (np.maximum(abs(x - at), abs(y - at)) < size / 2) if size else np.zeros_like(x, dtype=bool)
+    def with_hole(cells: float, at: float = 0.0) -> PictureAgreement:
+        """Return what is found of a plate where a wall has a square hole, in the plate's diagonal from its middle."""
+        hole = np.maximum(abs(x - at), abs(y - at)) < cells * cell / 2
         image = DepthImage(jnp.asarray(np.where(hole, 3.5, 3.0), dtype=jnp.float32), camera)
         found: PictureAgreement = compare(T, plate(), image, diameter)
         return found
 
-    cell = 1 / 31
-    whole, small, corner, large = without(0), without(4 * cell, 0.2), without(8 * cell, 0.5), without(11 * cell)
-    assert (whole.behind, whole.behind_in_3, whole.behind_in_7) == (0, 0, 0)
-    assert small.behind < 0.03
-    assert small.behind_in_3 == 1
-    assert 8 / 49 < small.behind_in_7 < 26 / 49  # so many cells of it are seen through in full
-    assert corner.behind_in_3 == 1
-    assert corner.behind_in_7 < 26 / 49  # what lies beyond the plate counts for nothing
-    assert (large.behind_in_3, large.behind_in_7) == (1, 1)
-    assert large.behind < 0.15
+    # A cell is seen through where all of it is.
+    for hole, number, in_3, in_7 in (
+        (with_hole(0), 0, 0, 0),
+        (with_hole(2.5, 0.2), 4, 4, 4),
+        (with_hole(4, 0.2), 9, 9, 9),
+        (with_hole(8, 0.5), 16, 9, 16),  # what lies beyond the plate's corner counts for nothing
+        (with_hole(11), 100, 9, 49),
+    ):
+        assert hole.behind == pytest.approx(number / 32**2)
+        assert hole.behind_in_3 == pytest.approx(in_3 / 9)
+        assert hole.behind_in_7 == pytest.approx(in_7 / 49)
 
 
 def test_holes_have_an_outline(depth: jax.Array) -> None:

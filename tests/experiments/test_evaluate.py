@@ -93,7 +93,7 @@ def test_a_package_that_is_missing_or_broken_is_told_in_a_line(tmp_path: Path, m
 
 
 def no_pictures(*_: Any) -> dict[str, Any]:
-    """Draw nothing: for pictures a whole bin is searched, which takes long."""
+    """Draw nothing: for one of the pictures a whole bin is searched, which takes long."""
     return {}
 
 
