@@ -26,6 +26,12 @@ def depth() -> jax.Array:
     return jnp.asarray(image)
 
 
+def directions() -> tuple[np.ndarray, np.ndarray]:
+    """Return x and y of what each pixel shows where it is one unit away."""
+    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
+    return (columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy
+
+
 def of(T: np.ndarray, depth: jax.Array) -> PictureAgreement:
     found: PictureAgreement = compare(
         jnp.asarray(T, dtype=jnp.float32),
@@ -53,8 +59,7 @@ def test_a_wall_goes_on_beyond_a_box_sunk_into_it(depth: jax.Array) -> None:
 
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.3, -0.2), (-0.5, 0.1)])
 def test_a_box_on_a_floor_is_above_it_and_one_in_it_is_buried(depth: jax.Array, tilt: tuple[float, float]) -> None:
-    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
-    x, y = (columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy
+    x, y = directions()
     floor = jnp.asarray(WALL / (1 - tilt[0] * x - tilt[1] * y), dtype=jnp.float32)
     down = np.array([-tilt[0], -tilt[1], 1.0]) / np.linalg.norm([*tilt, 1.0])
     along = np.cross([0.0, 1.0, 0.0], down)
@@ -82,10 +87,9 @@ def test_without_surroundings_nothing_is_buried(depth: jax.Array) -> None:
 
 def test_beside_a_slope_that_is_all_there_is_hardly_anything_is_known_to_be_buried(depth: jax.Array) -> None:
     # A slope that is measured to the right of the box alone, and would rise above all of it.
-    _, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
     T = pose((0.0, 0.0, WALL))
     edge = SIZES[0] / 2 / (WALL - SIZES[2] / 2)
-    x = (columns - CAMERA.cx) / CAMERA.fx
+    x, _ = directions()
     slope = np.where(x > edge, WALL / (1 + 2 * (edge - x)), 0)
     found = of(T, jnp.asarray(slope, dtype=jnp.float32))
     whole = of(T, jnp.asarray(np.where(x > edge, slope, WALL - SIZES[2] / 2), dtype=jnp.float32))
@@ -126,11 +130,7 @@ def test_a_sparse_image_of_a_wall_is_still_level(depth: jax.Array) -> None:
 
 def test_what_is_seen_through_counts_where_it_is_most() -> None:
     camera, diameter, T = intrinsics(CAMERA), jnp.float32(2**0.5), jnp.asarray(pose((0.0, 0.0, 3.0)), jnp.float32)
-    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
-    x, y = (
-        (place - center) / focal * 3
-        for place, center, focal in ((columns, CAMERA.cx, CAMERA.fx), (rows, CAMERA.cy, CAMERA.fy))
-    )
+    x, y = (3 * way for way in directions())
     cell = 1 / 31  # of the plate's 32, of which the outer ones have their middles on its edges
 
     def with_hole(cells: float, at: float = 0.0) -> PictureAgreement:
@@ -194,11 +194,7 @@ def plate(normal: tuple[float, float, float] = (0.0, 0.0, -1.0)) -> Surfels:
 def test_a_plate_in_a_larger_plane_is_told_from_one_that_ends(depth: jax.Array) -> None:
     camera, diameter, T = intrinsics(CAMERA), jnp.float32(2**0.5), jnp.asarray(pose((0.0, 0.0, 3.0)), jnp.float32)
     wall = jnp.full_like(depth, 3.0)
-    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
-    x, y = (
-        (place - center) / focal * 3
-        for place, center, focal in ((columns, CAMERA.cx, CAMERA.fx), (rows, CAMERA.cy, CAMERA.fy))
-    )
+    x, y = (3 * way for way in directions())
     own = jnp.asarray((abs(x) <= 0.5) & (abs(y) <= 0.5))
     in_wall = compare(T, plate(), DepthImage(wall, camera), diameter)
     above, on_floor = (
@@ -251,8 +247,7 @@ def test_relief_that_is_measured_and_relief_that_is_not(depth: jax.Array) -> Non
 
 def test_the_background_is_no_relief_nor_is_the_slant_of_a_plate(depth: jax.Array) -> None:
     camera, diameter = intrinsics(CAMERA), jnp.float32(2**0.5)
-    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
-    x, y = (columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy
+    x, y = directions()
     turn = np.pi / 9
     T = np.eye(4)
     T[:3, :3] = [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
