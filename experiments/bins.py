@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from kmn_jax.simulate import Bin
 
 _UNIT = "mm"
 _POINTS = 1000  # of an object's surface, for errors
+_STRANGERS = 2  # of an image
 THRESHOLD = 0.1  # of the diameter: a pose with less ADI is right
 LEAST_VISIBLE = 0.3  # share of a copy that is seen, from which on it ought to be found
 
@@ -38,7 +39,7 @@ class TrueImage:
 
     key: FrameKey
     part: Part
-    stranger: Part | None  # a part of about the same size of which there is no copy, where that is known
+    strangers: tuple[Part, ...]  # of about the same size, the nearest first; that there is no copy of them is known
     truth: Float[np.ndarray, "i 4 4"]
     visible: Float[np.ndarray, " i"]  # share of each copy that is seen
 
@@ -121,7 +122,7 @@ def bin_images(folder: Path, split: str, model: Model, every: int = 1) -> Iterat
         yield BinImage(
             key,
             part,
-            _like_in_size(part, parts.values()),
+            _like_in_size(part, [pair for pair in parts.items() if pair[0] != object_id]),
             *_truth(instances),
             make_scene(_scan(frame), part.diameter, inside=inside[frame.depth > 0]),
             inside,
@@ -161,11 +162,12 @@ def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldIm
         part = parts[object_id]
         frame = dataset.frame(*key, masks=True).with_visibility()
         instances = frame.instances or ()
-        others = [other for number, other in parts.items() if kinds[number] != kinds[object_id]]
+        others = [(kinds[number], other) for number, other in parts.items() if kinds[number] != kinds[object_id]]
+        may_lie = has_other_parts(family, len(instances))
         yield WorldImage(
             key,
             part,
-            None if has_other_parts(family, len(instances)) else _like_in_size(part, others),
+            () if may_lie else _like_in_size(part, others),
             *_truth(instances),
             family,
             numbers[kinds[object_id]],
@@ -189,10 +191,12 @@ def _truth(instances: Sequence[BopInstance]) -> tuple[Float[np.ndarray, "i 4 4"]
     return poses, np.array([instance.visible_fraction or 0.0 for instance in instances])
 
 
-def _like_in_size(part: Part, parts: Iterable[Part]) -> Part | None:
-    """Return the other part that is nearest in size, if there is one."""
-    others = (other for other in parts if other is not part)
-    return min(others, key=lambda other: abs(np.log(other.diameter / part.diameter)), default=None)
+def _like_in_size(part: Part, others: Iterable[tuple[Hashable, Part]]) -> tuple[Part, ...]:
+    """Return those of other parts, given with their kinds, that are nearest in size, the nearest first, one a kind."""
+    nearest: dict[Hashable, Part] = {}
+    for kind, other in sorted(others, key=lambda pair: abs(np.log(pair[1].diameter / part.diameter))):
+        nearest.setdefault(kind, other)
+    return tuple(nearest.values())[:_STRANGERS]
 
 
 def _scan(frame: BopFrame) -> Scan:

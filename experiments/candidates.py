@@ -61,7 +61,7 @@ _COLUMNS = (  # of what is stored
     "reported",
 )
 _MARGINS = (0.1, 0.4)  # diameters: so much of what is around copies is left in scans that are cut out
-_HOW = 2  # version of how is collected: it goes up with what is searched, of what and from where
+_HOW = 3  # version of how is collected: it goes up with what is searched, of what and from where
 _KINDS = 100  # more than the families of parts in a folder of world bins
 
 
@@ -81,7 +81,7 @@ class Search(NamedTuple):
     """One image and the part that is searched in it."""
 
     image: TrueImage
-    part: Part  # the image's own, or its stranger
+    part: Part  # the image's own, or a stranger
     on_device: DevicePart
     scene: Scene
     row: int  # of all searches
@@ -268,12 +268,14 @@ def _joined(columns: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def _searches(sources: Sources, network: Model) -> Iterator[Search]:
-    """Yield all images with their parts, and every second one with a part that is known not to be there, if any is."""
+    """Yield all images with their parts, and with one that is known not to be there, if any is.
+
+    What is searched in vain is the part that is nearest in size, and the next one, by turns.
+    """
     searches = count()
     for row, (number, image, scene, is_known) in enumerate(_images(sources, network)):
-        for part in (image.part, image.stranger if row % 2 == 0 else None):
-            if part is not None:
-                yield Search(image, part, device_part(network, part), scene, next(searches), number, is_known)
+        for part in (image.part, *image.strangers[row % 2 :][:1]):
+            yield Search(image, part, device_part(network, part), scene, next(searches), number, is_known)
 
 
 def _images(sources: Sources, network: Model) -> Iterator[tuple[int, TrueImage, Scene, bool]]:

@@ -86,7 +86,7 @@ def detect_in(estimator: PoseEstimator, real: RealScan) -> dict[str, Any]:
     part = estimator.prepare(real.cad, check_unit(real.cad_unit))
     result = estimator.detect(part, real.scan)
     inside = part.in_unit(real.scan.unit)
-    image = TrueImage(FrameKey(0, 0), inside, None, real.poses, np.ones(len(real.poses)))
+    image = TrueImage(FrameKey(0, 0), inside, (), real.poses, np.ones(len(real.poses)))
     accepted = np.array([pose.probability >= estimator.config.accepted for pose in result.poses], dtype=bool)
     errors = image.errors(np.array([pose.T_scene_object for pose in result.poses]).reshape(-1, 4, 4))
     right = errors < THRESHOLD

@@ -2,7 +2,7 @@
 
 The whole scan is given and nothing else. A pose is right if its ADI to a copy is below a tenth of the diameter and no
 more probable pose took that copy; recall counts the copies of which at least 30% is visible. In images without the
-part, and with `--strangers` for a part of about the same size in all others where it cannot lie, whatever is accepted
+part, and with `--strangers` for parts of about the same size in all others where they cannot lie, whatever is accepted
 is wrong. Ctrl+C ends it with the images so far.
 """
 
@@ -58,7 +58,7 @@ class Options:
     calibration: Path = SHIPPED
     every: int = 1  # use every so many images
     given: Literal["images", "clouds", "cut-outs"] = "images"  # cut-outs: clouds of what is near to copies alone
-    strangers: bool = False  # also search images for a part that is known not to be there
+    strangers: bool = False  # also search images for parts that are known not to be there
     json: Path | None = None
     picture: Path | None = None  # .png file for the reliability diagrams
     worst: Path | None = None  # folder for pictures of the three worst images of each family
@@ -135,8 +135,8 @@ def run(options: Options) -> dict[str, Any]:
             groups = [image.family, _ALL, *([] if image.family in _BUT else [_OTHERS])]
             for name in groups:
                 tallies[name].add(image, counted)
-            if options.strangers and image.stranger is not None:
-                _, found = found_in(model, fitted, image.stranger, scan)
+            for stranger in image.strangers if options.strangers else ():
+                _, found = found_in(model, fitted, stranger, scan)
                 for name in groups:
                     tallies[name].add_stranger(found)
         stopped = False

@@ -303,3 +303,15 @@ def motor() -> DevicePart:
     arrays = PartArrays(points, normals, jnp.zeros((128, 1)), jnp.float32(1.2))
     surfels = Surfels(points, normals, jnp.float32(2.5))
     return DevicePart(arrays, surfels, jnp.eye(4)[None], jnp.float32(0.1), jnp.eye(4)[None], jnp.zeros(1, bool))
+
+
+def test_each_image_is_searched_for_its_part_and_for_a_stranger_of_two_by_turns(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    strangers = [("a", "b"), ("c", "d"), (), ("e",), ("f",)]
+    images = [(7, SimpleNamespace(part=f"own {row}", strangers=of), "scene", False) for row, of in enumerate(strangers)]
+    monkeypatch.setattr(module, "_images", lambda sources, network: images)
+    monkeypatch.setattr(module, "device_part", lambda network, part: None)
+    searches: list[Any] = list(module._searches(Sources(), "network"))  # type: ignore[arg-type]
+    assert [search.part for search in searches] == ["own 0", "a", "own 1", "d", "own 2", "own 3", "own 4", "f"]
+    assert [search.row for search in searches] == list(range(8))

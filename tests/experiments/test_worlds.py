@@ -6,12 +6,14 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from experiments import detect_worlds
-from experiments.bins import LEAST_VISIBLE, WorldImage, world_images
+from experiments.bins import LEAST_VISIBLE, WorldImage, _like_in_size, world_images
 from experiments.candidates import as_given
 from experiments.detect_bins import Tally
 from experiments.detect_worlds import WorldTally, scan_of
@@ -74,9 +76,9 @@ def test_parts_in_rows_touch_nothing_but_each_other(folder: Path) -> None:
 def test_images_come_with_their_scans(folder: Path, model: Model, images: list[WorldImage]) -> None:
     assert [image.family for image in images] == ["mixed parts"] * 4 + ["touching rows"] * 4
     first, in_rows = images[0], images[4]
-    assert in_rows.stranger is not None
+    (stranger,) = in_rows.strangers  # there are two kinds
     names = json.loads((folder / "models" / "object_names.json").read_text())
-    numbers = [str(int(part.name.removeprefix("obj_"))) for part in (in_rows.part, in_rows.stranger)]
+    numbers = [str(int(part.name.removeprefix("obj_"))) for part in (in_rows.part, stranger)]
     assert {kind_of(names[number]) for number in numbers} == {"washer", "lever"}
     assert len(first.scan.points) == (first.scan.depth > 0).sum()  # type: ignore[operator]
     assert first.errors(first.truth).argmin(axis=1).tolist() == list(range(len(first.truth)))
@@ -87,8 +89,8 @@ def test_images_come_with_their_scans(folder: Path, model: Model, images: list[W
 def test_no_stranger_is_searched_where_it_may_lie(images: list[WorldImage]) -> None:
     """Other parts of an image, which are those nearest in size, have no poses: a stranger may be one of them."""
     for image in images:
-        others = image.family == "mixed parts" or not len(image.truth)
-        assert (image.stranger is None) == others
+        may_lie = image.family == "mixed parts" or not len(image.truth)
+        assert (not image.strangers) == may_lie
 
 
 def test_scans_are_cut_out_around_copies(images: list[WorldImage]) -> None:
@@ -185,3 +187,20 @@ def test_the_worst_images_are_drawn(images: list[WorldImage], tmp_path: Path) ->
         "mixed_parts-000001-000002-1_missed-1_wrong.png",
     ]
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in drawn)
+
+
+def test_strangers_are_the_parts_of_two_other_kinds_that_are_nearest_in_size() -> None:
+    parts: dict[str, Any] = {
+        name: SimpleNamespace(diameter=size) for name, size in zip("abcd", (9, 12, 8, 40), strict=True)
+    }
+    others = [
+        ("round", parts["d"]),
+        ("flat", parts["b"]),
+        ("round", parts["c"]),
+        ("round", parts["a"]),
+        ("flat", parts["c"]),
+    ]
+    found = _like_in_size(SimpleNamespace(diameter=10.0), others)  # type: ignore[arg-type]
+    assert found == (parts["a"], parts["b"])
+    assert _like_in_size(SimpleNamespace(diameter=10.0), others[:1]) == (parts["d"],)  # type: ignore[arg-type]
+    assert _like_in_size(SimpleNamespace(diameter=10.0), []) == ()  # type: ignore[arg-type]
