@@ -162,27 +162,25 @@ def collect(sources: Sources, fits: FitOptions, network: Model) -> dict[str, np.
     First around the seeds that detection begins with, which the model of poses as they are found is fitted to. Then,
     by such models that do not know the image's object, as detection does, round after round: where little is found most
     is wrong. Of parts that the network knows, no scale is fitted to which, only what was found first is refined. Images
-    are read twice, as they do not all fit into memory.
+    are read twice, as they do not all fit into memory; what was found first does.
     """
     config = DetectConfig().search_of(network.config)
-    known: dict[int, Candidates] = {}
+    first: dict[int, Candidates] = {}
     parts = []
     for search in _searches(sources, network):
         found = _propose(search, network, config, sources.method)(_first_seeds(search))
         parts.append(search.columns(found))
-        if search.is_known:
-            known[search.row] = _with_poses(found)
+        first[search.row] = _with_poses(found) if search.is_known else found
     poses = _joined(parts)
     none = np.zeros(len(poses["error"]), dtype=bool)
     poses |= {"refined": none, "due": none, "reported": none}
     others, of_all = _models(poses, fits), model_of(poses, fits)
     parts, searched = [], {}
     for search in _searches(sources, network):
-        if search.is_known:
-            found, chooser = known.pop(search.row), of_all
-        else:
+        found, chooser = first.pop(search.row), of_all
+        if not search.is_known:
             chooser = others.get(search.number, of_all)  # of an object without poses no model knows anything
-            found = _explored(search, _propose(search, network, config, sources.method), chooser)
+            found = _explored(search, _going_on(found, _propose(search, network, config, sources.method)), chooser)
         choice = chosen(found, chooser, search.on_device, _LOOSE)
         rows = np.flatnonzero(choice.kept | choice.contenders)
         if len(rows):
@@ -320,6 +318,13 @@ def _propose(
     if method == "FPFH":
         return partial(fpfh_poses, search.part, search.on_device, search.scene)
     return lambda rows: search_at(network, search.on_device, search.scene, rows, 0, config)
+
+
+def _going_on(
+    first: Candidates, propose: Callable[[Int[np.ndarray, " c"]], Candidates]
+) -> Callable[[Int[np.ndarray, " c"]], Candidates]:
+    """Return what finds the poses in crops around seeds, but for those around which they were found before."""
+    return lambda rows: first if np.array_equal(rows, first.seed_rows) else propose(rows)
 
 
 def _explored(

@@ -315,3 +315,12 @@ def test_each_image_is_searched_for_its_part_and_for_a_stranger_of_two_by_turns(
     searches: list[Any] = list(module._searches(Sources(), "network"))  # type: ignore[arg-type]
     assert [search.part for search in searches] == ["own 0", "a", "own 1", "d", "own 2", "own 3", "own 4", "f"]
     assert [search.row for search in searches] == list(range(8))
+
+
+def test_what_was_searched_before_is_not_searched_again() -> None:
+    first: Any = SimpleNamespace(seed_rows=np.array([3, 1]))
+    asked: list[list[int]] = []
+    propose: Any = module._going_on(first, lambda rows: asked.append(rows.tolist()) or "new")  # type: ignore[arg-type, func-returns-value]
+    assert propose(np.array([3, 1])) is first
+    assert [propose(np.array(rows)) for rows in ([1, 3], [3], [3, 1, 2])] == ["new"] * 3
+    assert asked == [[1, 3], [3], [3, 1, 2]]
