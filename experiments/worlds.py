@@ -52,10 +52,14 @@ from kmn_jax.simulate import (
 )
 
 NAMES, TARGETS = "worlds.json", "test_targets_bop19.json"
+_TURN = 3  # images that one after the other are of one sensor
 _ABSENT = 4  # of so many images one shows no copy of the part that is asked for
 _KINDS = 3  # of other parts in an image, those of about the size of the one that is asked for
 _TRIES = 6  # of an image's container, until parts come to rest in it
 _PHYSICS = BinConfig(time_cap=3.0, penetration=0.01, attempts=3)
+
+
+SensorKind = Literal["perfect", "structured_light", "stereo", "time_of_flight"]
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,7 @@ class Family:
     distance: tuple[float, float] = (6.0, 10.0)
     tilt: tuple[float, float] = (0.0, 20.0)  # degrees
     fill: tuple[float, float] = (0.75, 0.95)
-    sensor: Literal["perfect", "structured_light", "stereo", "time_of_flight"] = "structured_light"
+    sensor: SensorKind = "structured_light"
 
 
 FAMILIES = (
@@ -107,10 +111,11 @@ class Recipe:
     images: int = 24  # of each family of worlds: with fewer, its calibration error is mostly chance
     size: tuple[int, int] = (1280, 960)  # of an image, in pixels
     families: tuple[Family, ...] = FAMILIES  # one scene each
+    sensors: tuple[SensorKind, ...] = ()  # that take turns with each family's own, as in real scenes all may meet
 
 
 # Of parts that the network was trained with (`build_data surfels`): the fit of probabilities wants many kinds.
-TRAINING = Recipe(PARTS_SEED, tuple(TRAINING_FAMILIES), 1.0)
+TRAINING = Recipe(PARTS_SEED, tuple(TRAINING_FAMILIES), 1.0, sensors=("stereo", "time_of_flight"))
 VALIDATION = Recipe(11, VALIDATION_FAMILIES, 1.0, parts_a_family=4, images=16)
 TEST = Recipe(12, TEST_FAMILIES, 1.15)
 
@@ -141,6 +146,12 @@ def kind_of(name: str) -> str:
     return name.rpartition("_")[0]
 
 
+def sensed(family: Family, recipe: Recipe, image: int) -> Family:
+    """Return a family of worlds with the sensor of one of its images."""
+    sensors = (family.sensor, *recipe.sensors)
+    return replace(family, sensor=sensors[image // _TURN % len(sensors)])
+
+
 def has_other_parts(family: str, copies: int) -> bool:
     """Tell whether other parts, of about the same size, may lie in an image of so many copies; they have no poses."""
     return copies == 0 or any(one.others[1] for one in FAMILIES if one.name == family)
@@ -165,7 +176,7 @@ def _write_family(folder: Path, scene_id: int, recipe: Recipe, paths: list[Path]
         alike = sorted(range(len(paths)), key=lambda other: abs(np.log(loaded(other)[1].diagonal / size)))
         others = [other for other in alike if kind_of(paths[other].stem) != kind_of(paths[row].stem)][:_KINDS]
         absent = image % _ABSENT == _ABSENT - 1
-        tries = (_image(family, recipe, loaded, row, others, absent, rng) for _ in range(_TRIES))
+        tries = (_image(sensed(family, recipe, image), recipe, loaded, row, others, absent, rng) for _ in range(_TRIES))
         frame = next(filter(None, tries), None)
         if frame is None:
             raise InputError(f"{family.name}: {paths[row].stem} comes to rest in none of {_TRIES} containers")

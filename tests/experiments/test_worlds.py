@@ -18,7 +18,7 @@ from experiments.candidates import as_given
 from experiments.detect_bins import Tally
 from experiments.detect_worlds import WorldTally, scan_of
 from experiments.test_sets import SPLIT
-from experiments.worlds import FAMILIES, TARGETS, VALIDATION, build_worlds, kind_of
+from experiments.worlds import FAMILIES, TARGETS, TRAINING, VALIDATION, build_worlds, kind_of, sensed
 from experiments.worst_images import WorstImages
 from kmn_jax.bop import BopDataset
 from kmn_jax.detection import CropPrediction, Detection, Detections, Timing, make_scene
@@ -204,3 +204,14 @@ def test_strangers_are_the_parts_of_two_other_kinds_that_are_nearest_in_size() -
     assert found == (parts["a"], parts["b"])
     assert _like_in_size(SimpleNamespace(diameter=10.0), others[:1]) == (parts["d"],)  # type: ignore[arg-type]
     assert _like_in_size(SimpleNamespace(diameter=10.0), []) == ()  # type: ignore[arg-type]
+
+
+def test_sensors_take_turns_where_parts_are_known() -> None:
+    pile = next(family for family in FAMILIES if family.name == "deep pile")
+    sensors = [sensed(pile, TRAINING, image).sensor for image in range(TRAINING.images)]
+    assert sensors[:10] == ["structured_light"] * 3 + ["stereo"] * 3 + ["time_of_flight"] * 3 + ["structured_light"]
+    # Neither images without the part, every fourth, nor the ways in which scans are given go with one sensor.
+    assert (
+        {sensors[image] for image in range(3, 24, 4)} == {sensors[image] for image in range(0, 24, 3)} == set(sensors)
+    )
+    assert all(sensed(pile, VALIDATION, image) == pile for image in range(16))
