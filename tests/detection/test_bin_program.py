@@ -14,7 +14,6 @@ from kmn_jax.detection import (
     BinPoses,
     BinPosesConfig,
     CalibrationArrays,
-    CropSearchConfig,
     DepthImage,
     DevicePart,
     PoseEstimator,
@@ -31,7 +30,6 @@ ASSETS = Path(experiments.__file__).parent / "assets"
 IMAGE = max((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))
 OnDevice = tuple[DevicePart, CalibrationArrays]
 Seen = tuple[DepthImage, jax.Array, np.ndarray]
-CONFIG = BinPosesConfig(num_seeds=32, search=SearchConfig(CropSearchConfig(num_points=512, num_draws=4)))
 FLOOR_MARGIN = 3.0  # mm
 
 
@@ -61,6 +59,11 @@ def seen(estimator: PoseEstimator, motor: Part) -> Seen:
     return scene.image, above, np.array(scene.truth, dtype=np.float32)
 
 
+def usual(estimator: PoseEstimator) -> BinPosesConfig:
+    """Return what docs/detect.md calls the program with."""
+    return BinPosesConfig(search=SearchConfig().of_network(estimator.model.config))
+
+
 def solve(
     estimator: PoseEstimator,
     part: OnDevice,
@@ -69,7 +72,7 @@ def solve(
     key: jax.Array | None = None,
 ) -> BinPoses:
     key = jax.random.key(0) if key is None else key
-    return bin_poses(*estimator.model, *part, image, foreground, key, config=CONFIG)
+    return bin_poses(*estimator.model, *part, image, foreground, key, config=usual(estimator))
 
 
 def test_copies_are_found_from_the_likeliest_on(
@@ -91,7 +94,7 @@ def test_copies_are_found_from_the_likeliest_on(
     assert (np.diff(found.probability) <= 0).all()
     assert not found.mask[found.mask.sum() :].any(), "what there is comes first"
     np.testing.assert_array_equal(found.T_camera_object[~found.mask], np.eye(4)[None].repeat((~found.mask).sum(), 0))
-    assert found.overflow == (np.count_nonzero(np.asarray(image.depth)) > CONFIG.max_points)
+    assert found.overflow == (np.count_nonzero(np.asarray(image.depth)) > usual(estimator).max_points)
 
 
 def test_nothing_goes_through_the_host_and_bits_are_the_same(
@@ -122,8 +125,10 @@ def test_an_image_of_nothing_has_no_poses(
     found = solve(estimator, on_device, image, above)
     assert not found.mask.any()
     assert not found.probability.any()
-    np.testing.assert_array_equal(found.T_camera_object, np.eye(4)[None].repeat(CONFIG.num_seeds, 0))
-    assert found.overflow == (empty != "depth" and np.count_nonzero(np.asarray(image.depth)) > CONFIG.max_points)
+    np.testing.assert_array_equal(found.T_camera_object, np.eye(4)[None].repeat(usual(estimator).num_seeds, 0))
+    assert found.overflow == (
+        empty != "depth" and np.count_nonzero(np.asarray(image.depth)) > usual(estimator).max_points
+    )
 
 
 @pytest.mark.parametrize("values", [{"num_seeds": 0}, {"num_seeds": 64, "max_points": 32}])
