@@ -29,6 +29,7 @@ install_import_hook("kmn_jax", "beartype.beartype")
 
 _MEMORY_MAPS = Path("/proc/self/maps")
 _MANY_MAPS = 15_000
+_FEW = "jax_disable_most_optimizations"
 
 # Tracing makes a great many objects that stay: looking through all of them is a twentieth of the time. So that is left
 # to `_forget`.
@@ -48,31 +49,27 @@ def trace_what_is_tested() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def forget_what_was_compiled() -> Iterator[None]:
-    """Forget compiled programs before they take all the memory maps that Linux allows a process (65,530)."""
+def compile_as_the_file_asks(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Compile in half of the time what runs for moments only: programs are slower, and round otherwise.
+
+    Caches are not asked how a program was compiled, so all is forgotten where that changes; also before programs take
+    all the memory maps that Linux allows a process (65,530).
+    """
+    few = request.node.get_closest_marker("few_optimisations") is not None
+    if few != jax.config.values[_FEW]:
+        _forget()
+        jax.config.update(_FEW, few)
     yield
     if _MEMORY_MAPS.exists() and _MEMORY_MAPS.read_bytes().count(b"\n") > _MANY_MAPS:
         _forget()
 
 
-@pytest.fixture(scope="module")
-def few_optimisations() -> Iterator[None]:
-    """Compile in half of the time what runs for moments only: programs are slower, and round otherwise."""
-    yield from _compiling_with(few=True)
-
-
 @pytest.fixture
-def all_optimisations(few_optimisations: None) -> Iterator[None]:
+def all_optimisations() -> Iterator[None]:
     """Compile with what else is left out in this file: without, each use of a value may be rounded otherwise."""
-    yield from _compiling_with(few=False)
-
-
-def _compiling_with(few: bool) -> Iterator[None]:
-    before = jax.config.values["jax_disable_most_optimizations"]
-    jax.config.update("jax_disable_most_optimizations", few)
+    jax.config.update(_FEW, False)
     yield
-    jax.config.update("jax_disable_most_optimizations", before)
-    _forget()  # caches are not asked how a program was compiled: other files would run the slow ones for minutes
+    jax.config.update(_FEW, True)
 
 
 def _forget() -> None:

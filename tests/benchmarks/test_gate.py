@@ -10,7 +10,7 @@ from benchmarks import gate
 from benchmarks.network_cases import make_case
 from kmn_jax.errors import InputError
 
-pytestmark = pytest.mark.usefixtures("few_optimisations")
+pytestmark = pytest.mark.few_optimisations
 
 
 def test_a_ratio_that_has_fallen_too_far_is_named() -> None:

@@ -37,7 +37,7 @@ from kmn_jax.simulate import Surfels
 from tests.reference.clouds import box_cloud
 from tests.reference.networks import TINY
 
-pytestmark = pytest.mark.usefixtures("few_optimisations")
+pytestmark = pytest.mark.few_optimisations
 
 NETWORK = replace(TINY, num_keypoints=6)
 CROPS = CropSearchConfig(

@@ -22,7 +22,7 @@ from kmn_jax.geometry import (
 )
 from tests.reference.devices import accelerator_forms
 
-pytestmark = pytest.mark.usefixtures("few_optimisations")  # unrolled loops take long to compile
+pytestmark = pytest.mark.few_optimisations  # unrolled loops take long to compile
 
 
 @pytest.fixture

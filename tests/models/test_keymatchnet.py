@@ -23,7 +23,7 @@ from kmn_jax.models import (
 )
 from tests.reference.clouds import box_cloud, scene_crop
 
-pytestmark = pytest.mark.usefixtures("few_optimisations")
+pytestmark = pytest.mark.few_optimisations
 
 SMALL = {
     "edge_width": 32,

@@ -16,7 +16,7 @@ from kmn_jax.models._pair_head import (
 )
 from tests.models.test_layers import signed_layer
 
-pytestmark = pytest.mark.usefixtures("few_optimisations")
+pytestmark = pytest.mark.few_optimisations
 
 
 def signed_head(seed: int) -> PairHead:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
-# The longest first, and of them those that search bins, before those that forget what was compiled as they compile in
-# another way. Training comes second, so that with two workers one compiles the search and the other reads it.
+# The longest first, and of them those that search bins. Training comes second, so that with two workers one compiles
+# the search and the other reads it. Files that compile in another way stand together: before and after them all that
+# was compiled is forgotten.
 LONGEST = (
     "detection/test_estimator.py",
     "train/test_loop.py",
@@ -18,17 +19,28 @@ LONGEST = (
     "ros/test_results.py",
     "detection/test_bin_program.py",
     "train/test_sharding.py",
+    # In the other way:
     "detection/test_crop_search.py",
     "models/test_keymatchnet.py",
-    "pose/test_ransac.py",
     "experiments/test_evaluate_network.py",
+    "train/test_examples.py",
+    "models/test_pair_head.py",
+    "models/test_chirality.py",
+    "detection/test_search.py",
+    "simulate/test_worlds.py",
+    "geometry/test_accelerator_forms.py",
+    "geometry/test_groups.py",
+    "geometry/test_normals.py",
+    "pose/test_accelerator_forms.py",
+    "benchmarks/test_gate.py",
+    # In the usual way:
+    "pose/test_ransac.py",
     "train/test_checkpoint.py",
     "experiments/test_build_data.py",
     "data/test_build.py",
     "experiments/test_worlds.py",
     "viz/test_viewer.py",
     "viz/test_viewer_panel.py",
-    "train/test_examples.py",
     "train/test_rendered.py",
     "data/test_crops.py",
     "pose/test_icp.py",

@@ -30,7 +30,7 @@ from kmn_jax.simulate import (
 from kmn_jax.simulate._worlds import _lying
 from tests.reference.meshes import box
 
-pytestmark = pytest.mark.usefixtures("few_optimisations")
+pytestmark = pytest.mark.few_optimisations
 
 SIZE = np.array([0.08, 0.05, 0.033])  # metres
 DIAMETER = float(np.linalg.norm(SIZE))
