@@ -170,7 +170,7 @@ def collect(sources: Sources, fits: FitOptions, network: Model) -> dict[str, np.
     for search in _searches(sources, network):
         found = _propose(search, network, config, sources.method)(_first_seeds(search))
         parts.append(search.columns(found))
-        first[search.row] = _with_poses(found) if search.is_known else found
+        first[search.row] = _with_poses(found) if search.is_known else found  # which is gone on from, crops and all
     poses = _joined(parts)
     none = np.zeros(len(poses["error"]), dtype=bool)
     poses |= {"refined": none, "due": none, "reported": none}
