@@ -9,10 +9,11 @@ base
     Expected:  not yet known.
 
 base_worlds
-    Beside the variants of `configs/variants.py`, with as many samples.
+    Beside the variants of `configs/variants.py`, with half as many samples: what a lease of a GPU has time for.
     Command:   python -m experiments.train base_worlds
     Hardware:  one GPU. On an H200 its first step failed with 128 samples at once (jax 0.11.2: "select_k: scratch
-               capacity exceeded"), hence 64 here: 120 steps, beside other runs at 359 samples/s.
+               capacity exceeded"), hence 64 here: 359 to 499 samples/s beside other runs, so that its 500 steps take
+               three minutes after the first.
     Expected:  after 15,360 samples a validation loss of 2.77; not yet run to its end.
 """
 

@@ -13,8 +13,9 @@
 # large to carry, so that scenes of a pack need --examples.visibility splat in `train` below; worlds need no bits.
 # OUTPUT gets the runs as one tar file in pieces of 15.5 MB, after `stop` that of the first config with its newest
 # checkpoint. Let every `look` pack: a machine may be gone by the next call, and all that did not come back with it.
-# Compiling a step takes a minute of sixteen cores and longer beside others, so that few runs at once keep the device
-# busy. Leave XLA's autotuning on: without it products for gradients take most of a step.
+# Compiling a step takes a minute of sixteen cores and longer beside others, seven runs at once nearly seven minutes, so
+# that few runs at once keep the device busy. Leave XLA's autotuning on: without it products for gradients take most of a
+# step. Call `stop` from a file, not on a command line that holds "experiments.train": that line is ended, too.
 set -euo pipefail
 state=$(realpath -m "${KMN_DEVICE:-/tmp/kmn}")
 here=$(cd "$(dirname "$0")/.." && pwd)

@@ -174,11 +174,13 @@ def in_company(logits: Float[np.ndarray, " s"], together: Calibration) -> Float[
     """Return the log odds of poses given each other, of which each has its own; their order stays.
 
     A pose alone keeps its own, and a few poses have no less than their own: doubtful poses speak against each other
-    where there are several of them, but not where the last copy of a bin lies.
+    where there are several of them, but not where the last copy of a bin lies. A pose that its own evidence speaks
+    against is not probable in any company: that the part is there does not make all be parts that look like it.
     """
     if len(logits) < 2:
         return logits
     odds = together.logit(company(logits))
+    odds = np.where(logits < 0, np.minimum(odds, 0), odds)
     return odds if len(logits) >= _SEVERAL else np.maximum(logits, odds)
 
 

@@ -191,9 +191,11 @@ def test_poses_of_one_scene_are_judged_by_each_other() -> None:
         assert count > 3 or (together >= alone).all()
         assert (np.diff(together[np.argsort(alone, kind="stable")]) >= 0).all()  # the order stays
     np.testing.assert_allclose(models.of_scene(np.array([[1.2]])), own.probability(np.array([[1.2]])), rtol=1e-12)
-    two_doubtful, with_sure_ones = np.array([[-1.0], [-2.0]]), np.array([[-1.0], [6.0], [6.0]])
+    two_doubtful, with_sure_ones = np.array([[-1.0], [-2.0]]), np.array([[-1.0], [0.2], [6.0], [6.0]])
     np.testing.assert_allclose(models.of_scene(two_doubtful), own.probability(two_doubtful), rtol=1e-12)
-    assert models.of_scene(with_sure_ones)[0] > 1.5 * own.probability(with_sure_ones)[0]
+    against, doubtful = models.of_scene(with_sure_ones)[:2]
+    assert own.probability(with_sure_ones)[0] < against <= 0.5
+    assert doubtful > 1.3 * own.probability(with_sure_ones)[1]
     many_doubtful = np.linspace(-1, 1, 9)[:, None]
     assert (models.of_scene(many_doubtful) < own.probability(many_doubtful)).all()
 
