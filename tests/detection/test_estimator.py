@@ -37,9 +37,11 @@ from tests.reference.meshes import pose as placed
 from tests.reference.solids import revolution
 
 ASSETS = Path(__file__).parent.parent.parent / "experiments" / "assets"
-IMAGE = max((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))
+BINS = ASSETS / "small_test_set" / "test" / "000002" / "depth"
+FULL, IMAGE = BINS / "000003.png", BINS / "000000.png"  # of 18 copies, and of three: soon searched
 STEP = Path(__file__).parent.parent / "io" / "files" / "box.step"
 MOTOR = ASSETS / "industrial" / "gear_motor.stl"
+Bin = tuple[Scan, np.ndarray]  # and the poses of its parts
 
 
 @pytest.fixture(scope="module")
@@ -52,18 +54,22 @@ def motor(estimator: PoseEstimator) -> Part:
     return estimator.prepare(MOTOR)
 
 
-@pytest.fixture(scope="module")
-def seen() -> tuple[Scan, np.ndarray]:
-    """A bin, and the poses of its parts."""
-    scan, instances = bop_scan(IMAGE)
+def bin_of(image: Path) -> Bin:
+    scan, instances = bop_scan(image)
     assert instances is not None
     return scan, np.array([one.T_camera_object for one in instances], dtype=np.float32)
 
 
 @pytest.fixture(scope="module")
-def whole(estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray]) -> Detections:
-    """What is found in it."""
-    return estimator.detect(motor, seen[0])
+def seen() -> Bin:
+    return bin_of(IMAGE)
+
+
+@pytest.fixture(scope="module")
+def whole(estimator: PoseEstimator, motor: Part) -> tuple[Bin, Detections]:
+    """The full bin, and what is found in it."""
+    full = bin_of(FULL)
+    return full, estimator.detect(motor, full[0])
 
 
 def errors(pose: np.ndarray, truth: np.ndarray, part: Part) -> np.ndarray:
@@ -72,9 +78,9 @@ def errors(pose: np.ndarray, truth: np.ndarray, part: Part) -> np.ndarray:
 
 
 def test_a_bin_is_found_and_the_same_inputs_give_the_same_bits(
-    estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray], whole: Detections
+    estimator: PoseEstimator, motor: Part, whole: tuple[Bin, Detections]
 ) -> None:
-    (scan, truth), found = seen, whole
+    (scan, truth), found = whole
     assert len(found.poses) > 1
     likely = [pose for pose in found.poses if pose.probability >= 0.5]
     right = [errors(pose.T_scene_object, truth, motor).min() < 0.1 for pose in likely]
@@ -103,9 +109,7 @@ def test_a_bin_is_found_and_the_same_inputs_give_the_same_bits(
     assert written["timing"]["total_s"] == pytest.approx(found.timing.total)
 
 
-def test_units_frames_and_sensors_do_not_matter(
-    estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray]
-) -> None:
+def test_units_frames_and_sensors_do_not_matter(estimator: PoseEstimator, motor: Part, seen: Bin) -> None:
     scan, truth = seen
     in_metres = estimator.detect(motor, scan.in_unit("m"))
     assert in_metres.unit == "m"
@@ -122,10 +126,10 @@ def test_units_frames_and_sensors_do_not_matter(
 
 
 def test_places_and_crops_give_the_pose_there(
-    estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray], whole: Detections
+    estimator: PoseEstimator, motor: Part, whole: tuple[Bin, Detections]
 ) -> None:
-    scan, truth = seen
-    seed = max(whole.poses, key=lambda pose: pose.probability).seed
+    (scan, truth), found = whole
+    seed = max(found.poses, key=lambda pose: pose.probability).seed
     other = scan.points[np.linalg.norm(scan.points - seed, axis=1).argmax()]
     scene = estimator.scene(scan, motor, at=np.stack([seed, other]))
     there = estimator.detect(motor, scene, at=seed, top=1, T_base_camera=placed((0.3, 0, 1.2), np.eye(3)))  # metres
@@ -137,7 +141,7 @@ def test_places_and_crops_give_the_pose_there(
     assert (poses == there.poses[0].T_scene_object).all(axis=(1, 2)).any(), "whatever else is asked for"
 
 
-def test_several_parts_share_a_scene(estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray]) -> None:
+def test_several_parts_share_a_scene(estimator: PoseEstimator, motor: Part, seen: Bin) -> None:
     scan, _ = seen
     scene = estimator.scene(scan, motor)
     twin = replace(motor, name="twin")
@@ -150,9 +154,7 @@ def test_several_parts_share_a_scene(estimator: PoseEstimator, motor: Part, seen
     assert estimator.detect([], scene) == ()
 
 
-def test_a_driver_s_array_and_the_robot_s_frame(
-    estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray]
-) -> None:
+def test_a_driver_s_array_and_the_robot_s_frame(estimator: PoseEstimator, motor: Part, seen: Bin) -> None:
     scan, truth = seen
     assert scan.depth is not None
     assert scan.camera is not None
@@ -184,12 +186,10 @@ def test_a_driver_s_array_and_the_robot_s_frame(
     assert list(as_json(turned, "motor.stl", "scan.ply", facts)) == list(values)
 
 
-def test_candidates_have_evidence_and_some_are_right(
-    estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray]
-) -> None:
+def test_candidates_have_evidence_and_some_are_right(estimator: PoseEstimator, motor: Part, seen: Bin) -> None:
     scan, truth = seen
     scene = estimator.scene(scan, motor)
-    config = DetectConfig().search.of_network(estimator.model.config)
+    config = DetectConfig().search_of(estimator.model.config)  # what whole bins are searched with is compiled
     rows = seeds_over(scene, scene.foreground, motor)[:16]
     found = search_at(estimator.model, device_part(estimator.model, motor), scene, rows, 0, config)
     assert found.evidence.shape == (16 * config.crops.num_poses, len(EVIDENCE))
@@ -215,9 +215,7 @@ def test_a_symmetric_part_has_one_canonical_pose(estimator: PoseEstimator, mesh:
     assert np.trace(chosen[:3, :3]) >= np.trace(base[:3, :3]) - 1e-9
 
 
-def test_what_cannot_be_is_one_sentence(
-    estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray], tmp_path: Path
-) -> None:
+def test_what_cannot_be_is_one_sentence(estimator: PoseEstimator, motor: Part, seen: Bin, tmp_path: Path) -> None:
     scan, _ = seen
     with pytest.raises(InputError, match=r'probably millimetres: say unit="mm"$'):
         estimator.detect(motor, scan.points, unit="m")
@@ -290,7 +288,7 @@ def test_a_scan_without_the_part_is_an_empty_or_doubtful_result(estimator: PoseE
 
 
 def test_an_object_whose_unit_was_assumed_is_doubted_where_nothing_is_found(
-    estimator: PoseEstimator, seen: tuple[Scan, np.ndarray], tmp_path: Path
+    estimator: PoseEstimator, seen: Bin, tmp_path: Path
 ) -> None:
     mesh, (scan, _) = read_mesh(MOTOR), seen
     inches = (mesh.vertices / 25.4, mesh.triangles)
@@ -311,7 +309,7 @@ def test_an_object_whose_unit_was_assumed_is_doubted_where_nothing_is_found(
 
 
 def test_the_doubt_about_an_object_is_a_note_if_all_poses_are_doubtful(
-    estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray]
+    estimator: PoseEstimator, motor: Part, seen: Bin
 ) -> None:
     scan, truth = seen
     place = scan.points[np.linalg.norm(scan.points - truth[0][:3, 3], axis=1).argmin()][None]
@@ -326,9 +324,7 @@ def test_the_doubt_about_an_object_is_a_note_if_all_poses_are_doubtful(
         assert any("unit was taken to be mm" in warning for warning in found.warnings) == noted
 
 
-def test_parts_and_scans_may_lie_far_from_the_origin(
-    estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray]
-) -> None:
+def test_parts_and_scans_may_lie_far_from_the_origin(estimator: PoseEstimator, motor: Part, seen: Bin) -> None:
     scan, truth = seen
     near = scan.points[np.linalg.norm(scan.points - truth[0][:3, 3], axis=1) < motor.diameter].astype(np.float64)
     mesh = read_mesh(MOTOR)
@@ -364,7 +360,7 @@ def test_parts_and_scans_may_lie_far_from_the_origin(
 
 
 def test_an_exported_estimator_finds_the_same_without_this_package(
-    estimator: PoseEstimator, motor: Part, seen: tuple[Scan, np.ndarray], tmp_path: Path
+    estimator: PoseEstimator, motor: Part, seen: Bin, tmp_path: Path
 ) -> None:
     import subprocess
     import sys
