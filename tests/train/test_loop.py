@@ -6,6 +6,7 @@ import os
 import shlex
 import shutil
 import signal
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +19,15 @@ import pytest
 from experiments.train import main
 from kmn_jax.errors import InputError
 from kmn_jax.models import load_model
-from kmn_jax.train import NotFiniteError, data_mesh, read_metrics, train, training_source
+from kmn_jax.train import (
+    NotFiniteError,
+    OptimizerConfig,
+    data_mesh,
+    jit_train_step,
+    read_metrics,
+    train,
+    training_source,
+)
 from kmn_jax.train import _loop as loop
 from kmn_jax.train._checkpoint import Checkpoints
 from kmn_jax.train._loop import Outcome
@@ -34,6 +43,17 @@ pytestmark = [
 def one_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the command leave the devices of this process as they are."""
     monkeypatch.setenv("XLA_FLAGS", ONE_DEVICE)
+
+
+@pytest.fixture(autouse=True)
+def one_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trace the step once for runs of all lengths: of a schedule of steps it is the same."""
+
+    def of_usual_length(graphdef: Any, optimizer: OptimizerConfig, num_steps: int, *more: Any) -> Any:
+        assert optimizer.schedule == "step"
+        return jit_train_step(graphdef, optimizer, tiny().num_steps, *more)
+
+    monkeypatch.setattr(loop, "jit_train_step", of_usual_length)
 
 
 def train_quietly(folder: Path, resume: bool = False, **changes: Any) -> Outcome:
@@ -115,23 +135,42 @@ def test_a_killed_and_a_terminated_process_leave_a_run_to_go_on_with(
     long = {"num_steps": 20, "validate_every": 10, "checkpoint_every": 3, "log_every": 2}
     train_quietly(tmp_path / "whole", **long)
     folder, random = tmp_path / "a run", np.random.default_rng()
-    for number, fewest in ((signal.SIGKILL, 1), (signal.SIGTERM, 5)):
-        # Of 12 rows that the run writes, and at least one more than it has.
+    command = [*flags(**long), "--folder", str(folder), "--resume"]
+
+    def wait(fewest: int, ended: Callable[[], object]) -> None:
+        """Wait for some moment while the run has this row, of 12 that it writes, or one of the next."""
         rows = max(random.integers(fewest, fewest + 3), len(read_metrics(folder)) + 1)
-        moment = random.uniform(0, 0.3)
-        with run_train(*flags(**long), "--folder", folder, "--resume") as process:
-            while process.poll() is None and len(read_metrics(folder)) < rows:
-                time.sleep(0.02)
-            time.sleep(moment)
-            process.send_signal(number)
-            output, errors = process.communicate(timeout=200)
-        assert "Traceback" not in errors, errors
-        assert process.returncode == (0 if number == signal.SIGTERM else -signal.SIGKILL), (
-            f"{moment} s after row {rows}: {errors}"
-        )
+        while len(read_metrics(folder)) < rows and not ended():
+            time.sleep(0.02)
+        time.sleep(random.uniform(0, 0.3))
+
+    with run_train(*command) as process:
+        wait(1, lambda: process.poll() is not None)
+        process.send_signal(signal.SIGKILL)
+        _, errors = process.communicate(timeout=200)
+    assert "Traceback" not in errors, errors
+    assert process.returncode == -signal.SIGKILL, errors
+
+    # Then this process, which has traced the step; a signal that comes too late does not end it.
+    before, ended = signal.signal(signal.SIGTERM, signal.SIG_IGN), threading.Event()
+
+    def terminate() -> None:
+        wait(5, ended.is_set)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    sender = threading.Thread(target=terminate)
+    sender.start()
+    capsys.readouterr()
+    try:
+        assert main(command) == 0
+    finally:
+        ended.set()
+        sender.join()
+        signal.signal(signal.SIGTERM, before)
+    output, errors = capsys.readouterr()
+    assert "Traceback" not in errors, errors
     name, again = output.splitlines()[-1].split(" because SIGTERM came; go on with: python -m experiments.train ")
     assert name.startswith("stopped after step ")
-    capsys.readouterr()
     assert main(shlex.split(again)) == 0
     assert capsys.readouterr().out.splitlines()[-1].startswith("done: 20 steps; best validation loss")
     assert_same_runs(folder, tmp_path / "whole")
