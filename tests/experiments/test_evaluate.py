@@ -222,8 +222,11 @@ def test_an_ablation_changes_one_choice_at_a_time(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(ablate, "SINGLE", {})
     monkeypatch.setattr(ablate, "KEYPOINTS", {"10 keypoints": 10})
     monkeypatch.setattr(evaluate, "_TOGETHER", 1)  # of two
+    forgotten: list[bool] = []
+    monkeypatch.setattr(jax, "clear_caches", lambda: forgotten.append(True))  # other tests go on with what is compiled
     options = ["demo", "--objects", GEAR, "--images", "1", "--crops", "3", "--output", str(tmp_path / "out")]
     assert ablate.main(options) == 0
+    assert len(forgotten) == 1, "between the two"
     content = json.loads((tmp_path / "out" / "scores.json").read_text())
     assert {cell["method"] for cell in content["cells"]} == {
         f"{name}{refined}" for name in ("kmn_jax", "10 keypoints") for refined in ("", " + ICP")
