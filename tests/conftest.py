@@ -28,7 +28,7 @@ from jaxtyping import install_import_hook
 install_import_hook("kmn_jax", "beartype.beartype")
 
 _MEMORY_MAPS = Path("/proc/self/maps")
-_MANY_MAPS = 15_000
+_MANY_MAPS = 20_000
 _FEW = "jax_disable_most_optimizations"
 
 # Tracing makes a great many objects that stay: looking through all of them is a twentieth of the time. So that is left
@@ -45,6 +45,17 @@ def trace_what_is_tested() -> Iterator[None]:
     """Let commands that are called by tests keep no traced programs: they are those of the code as it is."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("kmn_jax.programs.keep_programs", lambda folder: None)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="module")
+def sample_each_surface_once(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Keep the surfaces of a few meshes for what asks for them again, but where these are what is tested."""
+    from tests.reference.surfaces import kept_surface
+
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.parent.name != "objects":
+            patch.setattr("kmn_jax.objects._object_model.outer_surface", kept_surface)
         yield
 
 
