@@ -21,8 +21,7 @@ from kmn_jax.serve import ServeConfig
 from tests.serve.serve_sample import running
 
 ASSETS = Path(__file__).parent.parent / "experiments" / "assets"
-# The image of the estimator's tests, so that what they have compiled is read.
-IMAGE = max((ASSETS / "small_test_set" / "test" / "000002" / "depth").glob("*.png"))
+IMAGE = ASSETS / "small_test_set" / "test" / "000002" / "depth" / "000000.png"  # of three copies: soon searched
 MOTOR = ASSETS / "industrial" / "gear_motor.stl"
 SHAFT = ASSETS / "industrial" / "shaft.stl"
 
@@ -97,7 +96,7 @@ def test_a_bin_in_all_forms_of_output(card: Path, tmp_path: Path, capsys: pytest
 
 def test_a_server_gives_what_a_search_here_gives(card: Path, tmp_path: Path) -> None:
     (tmp_path / "private").mkdir()
-    flags = ["--object", str(card), "--scene", str(IMAGE), "--top", "4", "--random-seed", "1"]
+    flags = ["--object", str(card), "--scene", str(IMAGE), "--top", "2", "--random-seed", "1"]
 
     def searched(name: str, *more: str) -> tuple[dict, list[dict[str, str]], bytes]:
         outputs = {flag: tmp_path / f"{name}{flag}.png" for flag in ("--json", "--bop-csv", "--save-picture")}
@@ -113,7 +112,7 @@ def test_a_server_gives_what_a_search_here_gives(card: Path, tmp_path: Path) -> 
         there = searched("there", "--server", f"http://127.0.0.1:{server.port}")
     here = searched("here")
     assert there[0] == here[0]
-    assert len(here[0]["poses"]) == 4
+    assert len(here[0]["poses"]) == 2
     assert there[1] == here[1]
     assert there[2].startswith(b"\x89PNG")
 
