@@ -19,8 +19,10 @@ from experiments.evaluation.methods import Ours
 from experiments.evaluation.sources import bop_objects
 from kmn_jax.detection import (
     CropSearchConfig,
+    DetectConfig,
     ForegroundOptions,
     PoseEstimator,
+    SearchConfig,
     draw_of_crop,
     matches_of,
     poses_at,
@@ -44,6 +46,7 @@ pytestmark = pytest.mark.few_optimisations
 
 SMALL = Path(experiments.__file__).parent / "assets" / "small_test_set"
 CONFIG = CropSearchConfig(num_points=512, num_draws=2, num_modes=2, icp=None)
+REFINED = IcpConfig(iterations=8)
 
 
 @pytest.fixture(scope="module")
@@ -114,9 +117,12 @@ def test_metres_and_millimetres_give_one_pose(model: Model, part: PartArrays, ca
 def test_the_evaluation_and_detection_at_a_point_have_one_pose(
     model: Model, cases: list[Case], gear: ObjectImages
 ) -> None:
-    estimator = PoseEstimator.from_pretrained()
+    usual = DetectConfig().search_of(model.config, at_places=True).crops
+    assert Ours("ours", model).config.of_network(model.config) == usual
+    crops = replace(CONFIG, icp=REFINED)
+    estimator = PoseEstimator.from_pretrained(config=DetectConfig(search=SearchConfig(crops=crops)))
     part, everything = make_part(gear.model, model), ForegroundOptions(remove_plane="never")
-    solver, compared = Ours("ours", model).prepare(gear.model), 0
+    solver, compared = Ours("ours", model, crops).prepare(gear.model), 0
     for case in cases[:3]:
         evaluated = solver(case)
         found = estimator.detect(
@@ -154,7 +160,7 @@ def test_poses_differ_the_best_first_and_are_refined(model: Model, part: PartArr
     case = cases[1]  # ICP leaves the pose of the first one as it is, where it found no better one
     rough, fine = (
         jax.device_get(poses_at(model, part, padded(case.points), 0, 0, replace(CONFIG, icp=icp)))
-        for icp in (None, IcpConfig(iterations=8))
+        for icp in (None, REFINED)
     )
     there = rough.poses.converged
     assert there[0]
