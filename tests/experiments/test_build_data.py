@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import build_data, kicad, test_sets
+from experiments import build_data, kicad, show_data, test_sets
 from experiments.build_data import SMALL_PACK, reach_beyond_bin
 from experiments.kicad import catalogue_sources
 from kmn_jax.bop import BopDataset
@@ -118,19 +118,27 @@ def test_small_pack_is_whole_and_of_the_recipe() -> None:
             assert reach_beyond_bin(item, drop.scene).max() < 0.003 * item.diameter
 
 
-def test_check_counts_copies_outside_and_names_damaged_files(tmp_path: Path) -> None:
+def test_check_counts_copies_outside_and_names_damaged_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     good = run("experiments.build_data", "check", "--folder", str(ASSETS / "small_pack"))
     assert good.returncode == 0, good.stderr
     assert "6 objects, 0 of them damaged; 60 scenes, 660 copies, 0 of them" in good.stdout
-    strict = run("experiments.build_data", "check", "--folder", str(ASSETS / "small_pack"), "--tolerance", "-0.1")
-    assert strict.returncode == 1
+
+    def failed(*arguments: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["build_data", "check", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            build_data.main()
+        assert ended.value.code == 1
+        return capsys.readouterr().out
+
+    assert "6 objects, 0 of them damaged" in failed("--folder", str(ASSETS / "small_pack"), "--tolerance", "-0.1")
     shutil.copytree(ASSETS / "small_pack", tmp_path / "pack")
     name = Pack(tmp_path / "pack").names()[0]
     (tmp_path / "pack" / "objects" / f"{name}.safetensors").write_bytes(b"")
-    damaged = run("experiments.build_data", "check", "--folder", str(tmp_path / "pack"))
-    assert damaged.returncode == 1
-    assert f"{name}.safetensors does not match" in damaged.stdout
-    assert "6 objects, 1 of them damaged; 50 scenes" in damaged.stdout
+    damaged = failed("--folder", str(tmp_path / "pack"))
+    assert f"{name}.safetensors does not match" in damaged
+    assert "6 objects, 1 of them damaged; 50 scenes" in damaged
 
 
 def test_reach_beyond_the_bin_is_that_of_the_farthest_point() -> None:
@@ -221,19 +229,10 @@ def test_builds_a_test_set_seen_by_a_sensor_and_keeps_recipes_apart(
         test_sets.build_test_set(tmp_path / "sensed", sources, config, workers=1)
 
 
-def test_shows_pack_and_test_set(tmp_path: Path) -> None:
-    result = run(
-        "experiments.show_data",
-        "--folder",
-        str(tmp_path),
-        "--objects",
-        "1",
-        "--drops",
-        "2",
-        "--crops.num-points",
-        "256",
-    )
-    assert result.returncode == 0, result.stderr
+def test_shows_pack_and_test_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = ["--folder", str(tmp_path), "--objects", "1", "--drops", "2", "--crops.num-points", "256"]
+    monkeypatch.setattr(sys, "argv", ["show_data", *options])
+    show_data.main()
     pictures = sorted(tmp_path.glob("*.png"))
     assert [picture.name[:5] for picture in pictures] == ["pack_", "small"]
     assert all(picture.stat().st_size > 20_000 for picture in pictures)
