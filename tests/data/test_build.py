@@ -136,7 +136,7 @@ def test_survives_kill_9_and_ends_with_the_same_files(tmp_path: Path) -> None:
     with journal.open("ab") as file:
         file.write(b'{"name": "box2", "spl')
     (tmp_path / "killed" / "objects" / "box2.safetensors").write_bytes(b"half")
-    build_pack(tmp_path / "killed", sources, CONFIG, workers=2)
+    build_pack(tmp_path / "killed", sources, CONFIG, workers=1)
     assert len(journal.read_bytes().splitlines()) == 4
     assert contents(tmp_path / "killed") == contents(tmp_path / "whole")
 
