@@ -174,6 +174,11 @@ def recipe(**changed: Any) -> dict[str, Any]:
     return json.loads(json.dumps(evaluate.recipe_of(replace(find_config("demo"), **changed), methods), default=str))
 
 
+@cache
+def usual_recipe() -> dict[str, Any]:
+    return recipe()
+
+
 @pytest.mark.parametrize(
     ("stage", "stale"),
     [
@@ -191,8 +196,8 @@ def recipe(**changed: Any) -> dict[str, Any]:
 def test_a_raised_version_makes_the_poses_of_its_own_stage_stale(
     stage: str, stale: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    Export.open(tmp_path, recipe(), overwrite=False)
-    Export.open(tmp_path, recipe(), overwrite=False)
+    for _ in range(2):
+        Export.open(tmp_path, usual_recipe(), overwrite=False)
     monkeypatch.setitem(VERSIONS, stage, 1 + VERSIONS[stage])
     with pytest.raises(InputError) as refused:
         Export.open(tmp_path, recipe(), overwrite=False)
@@ -200,7 +205,8 @@ def test_a_raised_version_makes_the_poses_of_its_own_stage_stale(
 
 
 def test_other_cases_make_all_poses_stale(tmp_path: Path) -> None:
-    Export.open(tmp_path, recipe(), overwrite=False)
+    for same in (usual_recipe(), recipe()):
+        Export.open(tmp_path, same, overwrite=False)
     with pytest.raises(InputError, match=r"\(differing: config\)"):
         Export.open(tmp_path, recipe(random_seed=1), overwrite=False)
 
