@@ -107,7 +107,8 @@ def fit(poses: dict[str, np.ndarray], options: FitOptions) -> Fitted:
 def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: FitOptions) -> Fitted:
     """Fit the model of what reported poses of one search say about each other, given the log odds of each.
 
-    What is judged are all reported poses. Raises InputError if no two are reported of one search.
+    What is judged are all reported poses. Raises InputError if no two are reported of one search, or if it would turn
+    their order round.
     """
     logits = logits[poses["reported"]]
     poses = {name: values[poses["reported"]] for name, values in poses.items()}
@@ -130,7 +131,10 @@ def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], 
             for rows in rows_of:
                 if own[rows[0]]:
                     held_out[rows] = in_company(logits[rows], others)
-    return Fitted(of_company(together), held_out, _judged(poses, held_out))
+    model = of_company(together)
+    if model.weights[0] <= 0:
+        raise InputError("of the poses of an image those are right no more often that are surer: give more bins")
+    return Fitted(model, held_out, _judged(poses, held_out))
 
 
 def _judged(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"]) -> dict[str, Any]:

@@ -15,7 +15,8 @@
 # checkpoint. Let every `look` pack: a machine may be gone by the next call, and all that did not come back with it.
 # Compiling a step takes a minute of sixteen cores and longer beside others, seven runs at once nearly seven minutes, so
 # that few runs at once keep the device busy. Leave XLA's autotuning on: without it products for gradients take most of a
-# step. Call `stop` from a file, not on a command line that holds "experiments.train": that line is ended, too.
+# step. Call `stop` and `steps` from a file: they end every process on whose command line experiments.train stands
+# before --folder and that place, such as a shell that was given a search for it.
 set -euo pipefail
 state=$(realpath -m "${KMN_DEVICE:-/tmp/kmn}")
 here=$(cd "$(dirname "$0")/.." && pwd)

@@ -74,8 +74,8 @@ class PictureAgreement(NamedTuple):
     surrounded: Scalar  # of the whole surface: inside of what is measured around it, see `_beside_outline`
     buried_between: Scalar  # buried, where each point of the surface counts as much as it is surrounded
     beside: Scalar  # what surrounds it: measured, and not in front
-    uneven: Scalar  # root mean square distance of that from its plane, in diameters, each half of one at most
-    buried_deep: Scalar  # buried by more than what surrounds it is uneven
+    uneven: Scalar  # root mean square of how far that is off its plane, in depth and diameters, each by 0.5 at most
+    buried_deep: Scalar  # buried by more than what surrounds it is uneven; by less than 2% more it counts in part
 
 
 class _Predicted(NamedTuple):

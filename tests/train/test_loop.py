@@ -169,6 +169,7 @@ def test_a_killed_and_a_terminated_process_leave_a_run_to_go_on_with(
         signal.signal(signal.SIGTERM, before)
     output, errors = capsys.readouterr()
     assert "Traceback" not in errors, errors
+    assert "because SIGTERM came" in output, output
     name, again = output.splitlines()[-1].split(" because SIGTERM came; go on with: python -m experiments.train ")
     assert name.startswith("stopped after step ")
     assert main(shlex.split(again)) == 0
