@@ -54,6 +54,7 @@ _COLUMNS = (  # of what is stored
     "largest_error",
     "object",
     "search",
+    "narrowed",
     "T_camera_object",
     "refined",
     "due",  # whether they are of what detection chooses among, which refines less; of parts that are not known
@@ -96,6 +97,7 @@ class Search(NamedTuple):
             "largest_error": self.errors(poses, self.image.largest_errors),
             "object": np.full(len(poses), self.number),
             "search": np.full(len(poses), self.row),
+            "narrowed": np.full(len(poses), self.scene.is_narrowed),
             "T_camera_object": poses,  # to judge it by other evidence
         }
 

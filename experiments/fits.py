@@ -20,7 +20,7 @@ from kmn_jax.detection import (
     expected_calibration_error,
     fit_calibration,
     fit_logistic,
-    in_company,
+    vouched,
 )
 from kmn_jax.errors import InputError
 
@@ -105,18 +105,18 @@ def fit(poses: dict[str, np.ndarray], options: FitOptions) -> Fitted:
 
 
 def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: FitOptions) -> Fitted:
-    """Fit the model of what reported poses of one search say about each other, given the log odds of each.
+    """Fit the model of what reported poses of one narrowed search say about each other, given the log odds of each.
 
-    What is judged are all reported poses. Raises InputError if no two are reported of one search, or if it would turn
-    their order round.
+    What is judged are all reported poses, of which those of other searches, and those that are alone, keep their odds.
+    Raises InputError if no two poses are reported of one such search.
     """
     logits = logits[poses["reported"]]
     poses = {name: values[poses["reported"]] for name, values in poses.items()}
-    right = poses["error"] < THRESHOLD
-    rows_of = [np.flatnonzero(poses["search"] == search) for search in np.unique(poses["search"])]
-    columns, together = np.zeros((len(logits), len(COMPANY))), np.zeros(len(logits), dtype=bool)
-    for rows in rows_of:
-        columns[rows], together[rows] = company(logits[rows]), len(rows) > 1
+    right, columns, together = poses["error"] < THRESHOLD, np.zeros((len(logits), 2)), poses["narrowed"].copy()
+    for search in np.unique(poses["search"]):
+        rows = np.flatnonzero(poses["search"] == search)
+        columns[rows] = company(logits[rows])
+        together[rows] &= len(rows) > 1
     if not together.any():
         raise InputError("in no image of the bins are two poses reported: give more bins")
 
@@ -125,16 +125,13 @@ def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], 
 
     held_out = logits.copy()
     for names in _folds(poses, options):
-        own = np.isin(poses["object"], names)
-        if (together & own).any():
+        own = together & np.isin(poses["object"], names)
+        if own.any():
             others = of_company(together & ~own)
-            for rows in rows_of:
-                if own[rows[0]]:
-                    held_out[rows] = in_company(logits[rows], others)
-    model = of_company(together)
-    if model.weights[0] <= 0:
-        raise InputError("of the poses of an image those are right no more often that are surer: give more bins")
-    return Fitted(model, held_out, _judged(poses, held_out))
+            for search in np.unique(poses["search"][own]):
+                rows = np.flatnonzero(poses["search"] == search)
+                held_out[rows] = vouched(logits[rows], others)
+    return Fitted(of_company(together), held_out, _judged(poses, held_out))
 
 
 def _judged(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"]) -> dict[str, Any]:

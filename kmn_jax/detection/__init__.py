@@ -11,10 +11,10 @@ from kmn_jax.detection._calibration import (
     chance_calibration_error,
     company,
     expected_calibration_error,
-    in_company,
     load_probabilities,
     probabilities_bytes,
     reliability,
+    vouched,
 )
 from kmn_jax.detection._canonical import canonical_pose
 from kmn_jax.detection._coverage import near_surface
@@ -165,7 +165,6 @@ __all__ = [
     "foreground",
     "gather_evidence",
     "grasp_conflict",
-    "in_company",
     "in_front_of_empty",
     "inside_bin",
     "into",
@@ -207,6 +206,7 @@ __all__ = [
     "surroundings",
     "symmetry_transforms",
     "table",
+    "vouched",
     "warnings_once",
     "with_grasps",
     "write_bop_csv",

@@ -134,22 +134,12 @@ def reliability(
     return [(float(probability[own].mean()), float(right[own].mean()), int(own.sum())) for own in chosen if own.any()]
 
 
-COMPANY = ("own", "best", "number")  # the evidence of `together`, see `company`
-_SURE = 2.5  # log odds from which on it makes no difference how sure the surest pose is
-_MANY = 20  # poses, from which on it makes no difference how many there are
-_SEVERAL = 4  # poses that may speak against each other
-_MOST_OF_THE_WAY, _NEARLY_EVEN = 0.75, 0.1  # see `in_company`
+COMPANY = ("own", "best")  # the evidence of `together`, see `company`
 
 
-def company(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 3"]:
-    """Return of each pose of one scene its log odds, those of the surest pose there and the logarithm of their number.
-
-    How sure the surest pose is tells whether the part is there at all; what poses there are of a part that is not there
-    are many and doubtful.
-    """
-    best = np.clip(logits.max(initial=0.0), 0.0, _SURE)
-    number = np.log(min(max(len(logits), 1), _MANY))
-    return np.stack([logits, np.full_like(logits, best), np.full_like(logits, number)], axis=1)
+def company(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2"]:
+    """Return of each pose of one scene its log odds, and those of the most probable pose there."""
+    return np.stack([logits, np.full_like(logits, logits.max(initial=-np.inf))], axis=1)
 
 
 @dataclass(frozen=True)
@@ -157,8 +147,9 @@ class Probabilities:
     """The model of poses as they are found, which chooses among them, and that of refined ones, which is reported.
 
     `exact` is of refined poses that are right in all of their points, not on average: it tells poses of one place apart
-    that are turned against each other. `together` is of poses in one scene, by what `refined` says of each: where some
-    are sure, doubtful ones are more often right than where all are doubtful.
+    that are turned against each other. `together` is of poses in one scene of which was said where parts are, by what
+    `refined` says of each: if one is sure, doubtful ones are more often right. Anywhere else poses tell little about
+    each other: there are walls, and other parts, to be mistaken.
     """
 
     found: Calibration
@@ -166,26 +157,19 @@ class Probabilities:
     exact: Calibration
     together: Calibration
 
-    def of_scene(self, evidence: Float[np.ndarray, "s f"]) -> Float[np.ndarray, " s"]:
+    def of_scene(self, evidence: Float[np.ndarray, "s f"], is_narrowed: bool) -> Float[np.ndarray, " s"]:
         """Return the probabilities of all refined poses that stand in one scene."""
-        return _logistic(in_company(self.refined.logit(evidence), self.together))
+        logits = self.refined.logit(evidence)
+        return _logistic(vouched(logits, self.together) if is_narrowed else logits)
 
 
-def in_company(logits: Float[np.ndarray, " s"], together: Calibration) -> Float[np.ndarray, " s"]:
-    """Return the log odds of poses given each other, of which each has its own; their order stays.
+def vouched(logits: Float[np.ndarray, " s"], together: Calibration) -> Float[np.ndarray, " s"]:
+    """Return the log odds of poses that vouch for each other: none has less than alone, and their order stays.
 
-    None is raised to more than most of the way to the surest by its own evidence, so that none vouches for itself, and
-    none to even odds that its own evidence speaks against: that the part is there does not make all be parts that look
-    like it. A pose alone keeps its own odds, and a few poses have no less than these: doubtful poses speak against each
-    other where there are several of them, but not where the last copy of a bin lies.
+    That doubtful poses speak against each other is left out: so they do in full bins, which are what is fitted to, but
+    not where the last copy lies.
     """
-    if len(logits) < 2:
-        return logits
-    odds = together.logit(company(logits))
-    raised = np.minimum(odds, logits + _MOST_OF_THE_WAY * (logits.max() - logits))
-    raised = np.where(logits < 0, np.minimum(raised, _NEARLY_EVEN * logits), raised)
-    lowered = odds if len(logits) >= _SEVERAL else logits
-    return np.where(odds > logits, raised, lowered)
+    return np.maximum(logits, together.logit(company(logits))) if len(logits) > 1 else logits
 
 
 def probabilities_bytes(probabilities: Probabilities) -> bytes:

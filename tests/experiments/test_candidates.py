@@ -102,6 +102,7 @@ def store(path: Path, network: Model, names: tuple[str, ...] = EVIDENCE, **other
         "largest_error": np.array([0.01, 0.2, 0.2, 0.2, 0.01, 0.01]),
         "object": np.array([7, 7, 7, 7, 8, 8]),
         "search": np.array([0, 0, 0, 0, 1, 1]),
+        "narrowed": np.zeros(6, dtype=bool),
         "T_camera_object": poses,
         "refined": np.array([False, True, True, True, True, True]),
         "due": np.array([False, True, True, True, False, False]),
@@ -211,7 +212,7 @@ def test_unknown_parts_are_searched_as_detection_does_and_known_ones_at_first_se
 
             def columns(found: Any, row: int = row) -> dict[str, np.ndarray]:
                 count = len(found.usable)
-                numbers = {"object": 7 + row, "search": row, "error": 0.01, "largest_error": 0.01}
+                numbers = {"object": 7 + row, "search": row, "error": 0.01, "largest_error": 0.01, "narrowed": False}
                 rows = {name: np.full(count, value) for name, value in numbers.items()}
                 evidence = np.full((count, len(EVIDENCE)), found.evidence[0])
                 return rows | {"evidence": evidence, "T_camera_object": poses[:count]}
