@@ -10,7 +10,7 @@ variant_...
                (dynamic) and 2.33 (invariant). In a pack that was built in part, of 1,267 objects for training, 2.35
                (reference), 2.27 (neighbors_20), and of 20 keypoints 1.77 (keypoints_20); in training 2.43 (reference),
                2.59 (narrow) and, of as many keypoints, 2.82 (keypoints_128) and 3.61 (keypoints_512). docs/training.md
-               has recalls of the first five.
+               has recalls.
 
 wide_long, dynamic_long
     The two that found more, trained for long: wide_long from random parameters, dynamic_long from those of `small`, as
