@@ -4,8 +4,8 @@ variant_reference is `small` itself; every other one differs from it by what its
 
 variant_...
     Command:   python -m experiments.train variant_reference, and the same with the other names
-    Hardware:  one H200, several side by side: 1,800 to 8,900 samples/s each; three minutes until the first step, of
-               seven runs at once nearly seven.
+    Hardware:  one H200, several side by side: 1,800 to 8,900 samples/s each; up to three minutes until the first
+               step, of seven runs at once nearly seven.
     Expected:  after 128,000 samples validation losses of 2.32 (reference), 2.31 (points_1024), 2.21 (wide), 2.42
                (dynamic) and 2.33 (invariant). In a pack that was built in part, of 1,267 objects for training, 2.35
                (reference), 2.27 (neighbors_20), and of 20 keypoints 1.77 (keypoints_20); in training 2.43 (reference),
