@@ -7,7 +7,7 @@ import difflib
 from configs.base import base, base_worlds
 from configs.debug import debug
 from configs.normalization import normalization_metric, normalization_released
-from configs.paper import paper, paper_tenth
+from configs.paper import paper, paper_tenth, paper_worlds
 from configs.per_object import per_object
 from configs.small import small, worlds, worlds_long
 from configs.variants import LONG, VARIANTS
@@ -19,6 +19,7 @@ CONFIGS: dict[str, TrainConfig] = {
     for config in (
         paper,
         paper_tenth,
+        paper_worlds,
         base,
         base_worlds,
         small,

@@ -13,12 +13,20 @@ paper_tenth
     The same number of steps on a tenth of the objects: how much the number of objects matters.
     Command:   python -m experiments.train paper_tenth
     Hardware:  as above. Not yet run here.
+
+paper_worlds
+    The published network and optimizer in scenes of all kinds, with as many samples, and as much of each rate, as a
+    lease of a GPU has time for.
+    Command:   python -m experiments.train paper_worlds
+    Hardware:  one GPU. Not yet run.
+    Expected:  not yet known.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+from configs.small import worlds
 from kmn_jax.data import PipelineConfig
 from kmn_jax.models import KeyMatchNetConfig
 from kmn_jax.train import OptimizerConfig, TrainConfig
@@ -38,3 +46,20 @@ paper = TrainConfig(
 )
 
 paper_tenth = replace(paper, name="paper_tenth", training_share=0.1)
+
+_LEASE = 6_000  # steps
+paper_worlds = replace(
+    paper,
+    name="paper_worlds",
+    pack=worlds.pack,
+    num_steps=_LEASE,
+    examples=replace(
+        worlds.examples,
+        crops=replace(worlds.examples.crops, num_points=paper.network.num_scene_points),
+        crops_per_scene=1,
+        random_keypoints=paper.examples.random_keypoints,
+    ),
+    optimizer=replace(paper.optimizer, decay_steps=_LEASE // 6),
+    validate_every=_LEASE // 2,
+    validation_samples=20,
+)
