@@ -18,8 +18,10 @@ paper_worlds
     The published network and optimizer in scenes of all kinds, with as many samples, and as much of each rate, as a
     lease of a GPU has time for.
     Command:   python -m experiments.train paper_worlds
-    Hardware:  one GPU. Not yet run.
-    Expected:  not yet known.
+    Hardware:  one H200, 6.5 minutes, 2.5 of them until the first steps: 840 samples/s, and 380 where `base_worlds`
+               trained beside it.
+    Expected:  after 84,000 samples, with 1,267 objects: validation loss 2.253, segmentation accuracy 0.689, keypoint
+               accuracy 0.086 of 20; docs/training.md has recalls.
 """
 
 from __future__ import annotations
