@@ -28,8 +28,10 @@ from kmn_jax.simulate import Bin
 
 _UNIT = "mm"
 _POINTS = 1000  # of an object's surface, for errors
+_SHARED_POINTS = 500  # of it, to see which share lies on another
 _STRANGERS = 2  # of an image
 THRESHOLD = 0.1  # of the diameter: a pose with less ADI is right
+_ALIKE = 0.03, 2 / 3  # diameters, within which at least such a share of two surfaces lies on the other
 LEAST_VISIBLE = 0.3  # share of a copy that is seen, from which on it ought to be found
 
 
@@ -54,6 +56,30 @@ class TrueImage:
         points, turns = jnp.asarray(self.part.points[:_POINTS]), symmetry_transforms(self.part.symmetries)
         found = np.asarray(mssd_of_pairs(self._pairs(poses), points, jnp.asarray(turns)))
         return found[: len(poses) * len(self.truth)].reshape(len(poses), len(self.truth)) / self.part.diameter
+
+    def looks_like(self, other: Part, poses: Float[np.ndarray, "s 4 4"]) -> Bool[np.ndarray, " s"]:
+        """Return which poses of another part lie on a copy so closely that a sensor hardly tells the two apart.
+
+        Most of the one surface then lies on the other, and most of that on it: a flat part on a large one does not.
+        """
+        from scipy.spatial import cKDTree
+
+        near, least = _ALIKE[0] * other.diameter, _ALIKE[1]
+        points = [of.points[:_SHARED_POINTS] for of in (other, self.part)]
+        trees = [cKDTree(of.points) for of in (self.part, other)]
+        reach = 0.5 * (other.diameter + self.part.diameter)
+        result = np.zeros(len(poses), dtype=bool)
+        for row, pose in enumerate(poses):
+            for true in self.truth:
+                T_own_other = np.linalg.inv(true) @ pose
+                moves = T_own_other, np.linalg.inv(T_own_other)
+                moved = [of @ move[:3, :3].T + move[:3, 3] for of, move in zip(points, moves, strict=True)]
+                if np.linalg.norm(moved[0].mean(axis=0) - points[1].mean(axis=0)) < reach:
+                    distances = (
+                        tree.query(of, distance_upper_bound=near)[0] for tree, of in zip(trees, moved, strict=True)
+                    )
+                    result[row] |= all(np.isfinite(distance).mean() >= least for distance in distances)
+        return result
 
     def offset(self, pose: Float[np.ndarray, "4 4"], copy: int) -> tuple[float, float]:
         """Return by how many degrees, symmetries taken out, and millimetres a pose is off a true one."""

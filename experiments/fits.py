@@ -34,11 +34,18 @@ class FitOptions:
     folds: int = 5
     members: int = 3  # fits, whose mean is the model of refined poses
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
+    reported_weight: float = 8.0  # of poses that detection reports, of parts that are there: they are what is judged
 
 
 def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return poses that are right if all of their points are."""
     return poses | {"error": poses["largest_error"]}
+
+
+def told(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return those poses of which it is known whether they are right."""
+    known = ~np.isnan(poses["error"])
+    return {column: values[known] for column, values in poses.items()}
 
 
 def held_out_models(
@@ -59,18 +66,21 @@ def _folds(poses: dict[str, np.ndarray], options: FitOptions) -> list[Int[np.nda
 def model_of(poses: dict[str, np.ndarray], options: FitOptions) -> Calibration:
     """Return the model that is fitted to poses, of one member if any of them is as it was found."""
     members = options.members if poses["refined"].all() else 1  # one is enough to choose what is refined
+    poses = told(poses)
     right, weights = poses["error"] < THRESHOLD, _weights(poses, options)
     return fit_calibration(poses["evidence"], right, EVIDENCE, weights, members=members)
 
 
 def _weights(poses: dict[str, np.ndarray], options: FitOptions) -> Float[np.ndarray, " s"]:
-    """Return how much poses count: refined ones of absent parts more than others, and all less if an object has many.
+    """Return how much poses count: what is reported and refined ones of absent parts more than others.
 
-    What objects, or families of parts, have in common is to be learned, not what those few are like that have most.
+    All count less if an object has many: what objects, or families of parts, have in common is to be learned, not what
+    those few are like that have most.
     """
     absent = ~np.isfinite(poses["error"])
     _, which, counts = np.unique(poses["object"], return_inverse=True, return_counts=True)
-    weights = np.where(absent & poses["refined"], options.absent_weight, 1.0) / np.sqrt(counts[which])
+    of_present = np.where(poses["reported"], options.reported_weight, 1.0)
+    weights = np.where(absent & poses["refined"], options.absent_weight, of_present) / np.sqrt(counts[which])
     return weights * (len(weights) / max(weights.sum(), 1e-9))
 
 
