@@ -34,7 +34,7 @@ class FitOptions:
     folds: int = 5
     members: int = 3  # fits, whose mean is the model of refined poses
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
-    reported_weight: float = 8.0  # of poses that detection reports, of parts that are there: they are what is judged
+    reported_weight: float = 32.0  # of poses that detection reports, of parts that are there: they are what is judged
 
 
 def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
