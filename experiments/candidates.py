@@ -61,7 +61,7 @@ _COLUMNS = (  # of what is stored
     "reported",
 )
 _MARGINS = (0.1, 0.4)  # diameters: so much of what is around copies is left in scans that are cut out
-_HOW = 4  # version of how is collected: it goes up with what is searched, of what and from where
+_HOW = 4  # version of how is collected: it goes up with what is searched, of what and from where, and what is right
 _KINDS = 100  # more than the families of parts in a folder of world bins
 
 
@@ -91,10 +91,12 @@ class Search(NamedTuple):
     def columns(self, found: Candidates) -> dict[str, np.ndarray]:
         """Return evidence, errors and object of poses."""
         poses = found.T_camera_object[found.usable]
+        error = self.errors(poses, self.image.errors)
+        is_own = self.part is self.image.part
         return {
             "evidence": found.evidence[found.usable],
-            "error": self.errors(poses, self.image.errors),
-            "largest_error": self.errors(poses, self.image.largest_errors),
+            "error": error,
+            "largest_error": self.errors(poses, self.image.largest_errors) if is_own else error,
             "object": np.full(len(poses), self.number),
             "search": np.full(len(poses), self.row),
             "narrowed": np.full(len(poses), self.scene.is_narrowed),
@@ -104,9 +106,9 @@ class Search(NamedTuple):
     def errors(
         self, T_camera_object: Float32[np.ndarray, "s 4 4"], measure: Callable[[np.ndarray], np.ndarray]
     ) -> Float[np.ndarray, " s"]:
-        """Return by how much poses are off the nearest copy; of a part that is not there, by no finite number.
+        """Return by how much poses are off the nearest copy: of a part that is not there infinitely.
 
-        It is none at all where that part looks like the one that is there: such poses are neither right nor wrong.
+        It is NaN where such a part hardly differs from the copy that it is found at: neither right nor wrong.
         """
         poses = self.scene.T_scene_camera @ T_camera_object
         if self.part is not self.image.part:
@@ -247,6 +249,7 @@ def _with_reported(
 ) -> dict[str, np.ndarray]:
     """Return poses with what detection reports of each search, by models that do not know the image's object."""
     fine = {name: values[poses["refined"]] for name, values in poses.items()}
+    fine["reported"] = np.zeros_like(fine["refined"])  # what was reported before does not count
     others, exact = (_models(rows, fits) for rows in (fine, by_largest_error(fine)))
     reported = np.zeros(len(poses["error"]), dtype=bool)
     for row, on_device in searched.items():

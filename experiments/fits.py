@@ -34,7 +34,7 @@ class FitOptions:
     folds: int = 5
     members: int = 3  # fits, whose mean is the model of refined poses
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
-    reported_weight: float = 32.0  # of poses that detection reports, of parts that are there: they are what is judged
+    reported_weight: float = 32.0  # of those that detection reports of parts that are there: the rest it drops
 
 
 def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -64,7 +64,7 @@ def _folds(poses: dict[str, np.ndarray], options: FitOptions) -> list[Int[np.nda
 
 
 def model_of(poses: dict[str, np.ndarray], options: FitOptions) -> Calibration:
-    """Return the model that is fitted to poses, of one member if any of them is as it was found."""
+    """Return the model that is fitted to those poses that are `told`, of one member if any is as it was found."""
     members = options.members if poses["refined"].all() else 1  # one is enough to choose what is refined
     poses = told(poses)
     right, weights = poses["error"] < THRESHOLD, _weights(poses, options)
@@ -72,7 +72,7 @@ def model_of(poses: dict[str, np.ndarray], options: FitOptions) -> Calibration:
 
 
 def _weights(poses: dict[str, np.ndarray], options: FitOptions) -> Float[np.ndarray, " s"]:
-    """Return how much poses count: what is reported and refined ones of absent parts more than others.
+    """Return how much poses count: what is reported of parts that are there most, refined ones of absent parts more.
 
     All count less if an object has many: what objects, or families of parts, have in common is to be learned, not what
     those few are like that have most.
@@ -95,8 +95,8 @@ class Fitted(NamedTuple):
 def fit(poses: dict[str, np.ndarray], options: FitOptions) -> Fitted:
     """Fit a model of evidence.
 
-    Where some poses are those that detection reports, the scale of the model is fitted to them, as models of other
-    objects predict them, and they are what is judged.
+    Of all poses it must be `told` whether they are right. Where some are those that detection reports, the scale of the
+    model is fitted to them, as models of other objects predict them, and they are what is judged.
     """
     right = poses["error"] < THRESHOLD
     held_out = np.zeros(len(right))

@@ -71,6 +71,7 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def models(poses: dict[str, np.ndarray], fits: FitOptions) -> Any:
         assert poses["refined"].all()
+        assert not poses["reported"].any()
         return [(np.unique(poses["object"]), int((poses["error"] < 0.1).sum()))]
 
     def all_but_the_first(found: Candidates, model: int, part: Any, config: Any, exact: int) -> Any:
@@ -106,7 +107,7 @@ def store(path: Path, network: Model, names: tuple[str, ...] = EVIDENCE, **other
         "T_camera_object": poses,
         "refined": np.array([False, True, True, True, True, True]),
         "due": np.array([False, True, True, True, False, False]),
-        "reported": np.zeros(6, dtype=bool),
+        "reported": np.array([False, True, False, False, False, False]),
     }
     np.savez(path, **stored | others)
 
@@ -281,19 +282,20 @@ def test_a_stranger_that_looks_like_the_part_is_neither_right_nor_wrong() -> Non
 
     def looks_like(part: str, poses: np.ndarray) -> np.ndarray:
         assert part == "stranger"
-        np.testing.assert_array_equal(poses[:, 0, 3], 5.0)  # in the scene's frame
+        np.testing.assert_array_equal(poses[:, :3, 3], [[5, 1, 0]] * 2)  # in the scene's frame
         return alike
 
     image: Any = SimpleNamespace(part="own", looks_like=looks_like)
-    T_scene_camera = np.eye(4, dtype=np.float32)
-    T_scene_camera[0, 3] = 5.0
+    T_scene_camera = np.array([[0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float32)
     scene: Any = SimpleNamespace(T_scene_camera=T_scene_camera)
     poses = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
+    poses[:, 0, 3] = 1.0
     nothing: Any = None
     search = module.Search(image, "stranger", nothing, scene, 0, 7, False)  # type: ignore[arg-type]
     np.testing.assert_array_equal(search.errors(poses, nothing), [np.inf, np.nan])
     own = search._replace(part=image.part)
-    np.testing.assert_array_equal(own.errors(poses, lambda given: given[:, :2, 3] / 10), [0, 0])
+    np.testing.assert_array_equal(own.errors(poses, lambda given: given[:, :2, 3]), [1, 1])
+    np.testing.assert_array_equal(own.errors(poses, lambda given: given[:, :1, 3]), [5, 5])
 
 
 @pytest.mark.usefixtures("searched")
