@@ -72,6 +72,7 @@ def test_a_box_on_a_floor_is_above_it_and_one_in_it_is_buried(depth: jax.Array, 
     assert above.buried < 0.01
     assert below.buried > 0.6  # all but the front and the upper edges of the sides
     assert above.surrounded > 0.8
+    assert max(above.uneven, below.uneven) < 0.01
     assert above.buried_between < 0.01
     assert 0.2 < below.buried_between < below.surrounded  # what is in front of the box hides it, and is not around it
     height = SIZES[2] / 2 / down[2] / PART.diameter  # of the middle, along the line of sight
