@@ -249,7 +249,6 @@ def _with_reported(
 ) -> dict[str, np.ndarray]:
     """Return poses with what detection reports of each search, by models that do not know the image's object."""
     fine = {name: values[poses["refined"]] for name, values in poses.items()}
-    fine["reported"] = np.zeros_like(fine["refined"])  # what was reported before does not count
     others, exact = (_models(rows, fits) for rows in (fine, by_largest_error(fine)))
     reported = np.zeros(len(poses["error"]), dtype=bool)
     for row, on_device in searched.items():

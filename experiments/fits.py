@@ -34,7 +34,6 @@ class FitOptions:
     folds: int = 5
     members: int = 3  # fits, whose mean is the model of refined poses
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
-    reported_weight: float = 32.0  # of those that detection reports of parts that are there: the rest it drops
 
 
 def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -72,15 +71,13 @@ def model_of(poses: dict[str, np.ndarray], options: FitOptions) -> Calibration:
 
 
 def _weights(poses: dict[str, np.ndarray], options: FitOptions) -> Float[np.ndarray, " s"]:
-    """Return how much poses count: what is reported of parts that are there most, refined ones of absent parts more.
+    """Return how much poses count: refined ones of absent parts more than others, and all less if an object has many.
 
-    All count less if an object has many: what objects, or families of parts, have in common is to be learned, not what
-    those few are like that have most.
+    What objects, or families of parts, have in common is to be learned, not what those few are like that have most.
     """
     absent = ~np.isfinite(poses["error"])
     _, which, counts = np.unique(poses["object"], return_inverse=True, return_counts=True)
-    of_present = np.where(poses["reported"], options.reported_weight, 1.0)
-    weights = np.where(absent & poses["refined"], options.absent_weight, of_present) / np.sqrt(counts[which])
+    weights = np.where(absent & poses["refined"], options.absent_weight, 1.0) / np.sqrt(counts[which])
     return weights * (len(weights) / max(weights.sum(), 1e-9))
 
 
