@@ -28,8 +28,10 @@ from kmn_jax.simulate import Bin
 
 _UNIT = "mm"
 _POINTS = 1000  # of an object's surface, for errors
+_SHARED_POINTS = 500  # of it, to see which share lies on another
 _STRANGERS = 2  # of an image
 THRESHOLD = 0.1  # of the diameter: a pose with less ADI is right
+_ALIKE = 0.03, 2 / 3  # diameters of a stranger, within which such a share of either surface lies on the other
 LEAST_VISIBLE = 0.3  # share of a copy that is seen, from which on it ought to be found
 
 
@@ -54,6 +56,32 @@ class TrueImage:
         points, turns = jnp.asarray(self.part.points[:_POINTS]), symmetry_transforms(self.part.symmetries)
         found = np.asarray(mssd_of_pairs(self._pairs(poses), points, jnp.asarray(turns)))
         return found[: len(poses) * len(self.truth)].reshape(len(poses), len(self.truth)) / self.part.diameter
+
+    def looks_like(self, other: Part, poses: Float[np.ndarray, "s 4 4"]) -> Bool[np.ndarray, " s"]:
+        """Return at which poses another part hardly differs from a copy.
+
+        Two thirds of its surface then lie on that of the copy, and two thirds of that on its own: of a plate at the
+        side of a box the first holds, the second does not.
+        """
+        from scipy.spatial import cKDTree
+
+        near, least = _ALIKE[0] * other.diameter, _ALIKE[1]
+        points = [part.points[:_SHARED_POINTS] for part in (other, self.part)]
+        trees = [cKDTree(part.points) for part in (self.part, other)]  # the surface that the points are to lie on
+        found, true = (
+            pose[:, :3, :3] @ of.mean(axis=0) + pose[:, :3, 3]
+            for pose, of in zip((poses, self.truth), points, strict=True)
+        )
+        is_near = np.linalg.norm(found[:, None] - true[None], axis=2) < 0.5 * (other.diameter + self.part.diameter)
+        result = np.zeros(len(poses), dtype=bool)
+        for row, copy in np.argwhere(is_near):
+            T_own_other = np.linalg.inv(self.truth[copy]) @ poses[row]
+            moves = T_own_other, np.linalg.inv(T_own_other)
+            result[row] |= all(
+                np.isfinite(tree.query(of @ move[:3, :3].T + move[:3, 3], distance_upper_bound=near)[0]).mean() >= least
+                for tree, of, move in zip(trees, points, moves, strict=True)
+            )
+        return result
 
     def offset(self, pose: Float[np.ndarray, "4 4"], copy: int) -> tuple[float, float]:
         """Return by how many degrees, symmetries taken out, and millimetres a pose is off a true one."""

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from tqdm import tqdm
 
 from experiments.bins import TrueImage, WorldImage, bin_images, world_images
-from experiments.fits import FitOptions, by_largest_error, held_out_models, model_of
+from experiments.fits import FitOptions, by_largest_error, held_out_models, model_of, told
 from experiments.fpfh import fpfh_poses
 from experiments.test_sets import SPLIT
 from kmn_jax.detection import (
@@ -61,7 +61,7 @@ _COLUMNS = (  # of what is stored
     "reported",
 )
 _MARGINS = (0.1, 0.4)  # diameters: so much of what is around copies is left in scans that are cut out
-_HOW = 3  # version of how is collected: it goes up with what is searched, of what and from where
+_HOW = 4  # version of how is collected: it goes up with what is searched, of what and from where, and what is right
 _KINDS = 100  # more than the families of parts in a folder of world bins
 
 
@@ -91,10 +91,12 @@ class Search(NamedTuple):
     def columns(self, found: Candidates) -> dict[str, np.ndarray]:
         """Return evidence, errors and object of poses."""
         poses = found.T_camera_object[found.usable]
+        error = self.errors(poses, self.image.errors)
+        is_own = self.part is self.image.part
         return {
             "evidence": found.evidence[found.usable],
-            "error": self.errors(poses, self.image.errors),
-            "largest_error": self.errors(poses, self.image.largest_errors),
+            "error": error,
+            "largest_error": self.errors(poses, self.image.largest_errors) if is_own else error,
             "object": np.full(len(poses), self.number),
             "search": np.full(len(poses), self.row),
             "narrowed": np.full(len(poses), self.scene.is_narrowed),
@@ -104,10 +106,14 @@ class Search(NamedTuple):
     def errors(
         self, T_camera_object: Float32[np.ndarray, "s 4 4"], measure: Callable[[np.ndarray], np.ndarray]
     ) -> Float[np.ndarray, " s"]:
-        """Return by how much poses are off the nearest copy; of a part that is not there, by no finite number."""
+        """Return by how much poses are off the nearest copy: of a part that is not there infinitely.
+
+        It is NaN where such a part hardly differs from the copy that it is found at: neither right nor wrong.
+        """
+        poses = self.scene.T_scene_camera @ T_camera_object
         if self.part is not self.image.part:
-            return np.full(len(T_camera_object), np.inf)
-        return measure(self.scene.T_scene_camera @ T_camera_object).min(axis=1, initial=np.inf)
+            return np.where(self.image.looks_like(self.part, poses), np.nan, np.inf)
+        return measure(poses).min(axis=1, initial=np.inf)
 
 
 def poses_to_fit(
@@ -131,7 +137,7 @@ def poses_to_fit(
         if lacking:
             raise InputError(f"{stored} lacks {', '.join(lacking)}, which comes of crops: remove it, to search again")
         if used == EVIDENCE and not sources.judge_anew:
-            return poses | {"evidence": poses["evidence"][:, [names.index(name) for name in EVIDENCE]]}
+            return told(poses | {"evidence": poses["evidence"][:, [names.index(name) for name in EVIDENCE]]})
         unused = [column for column, name in enumerate(names) if name not in EVIDENCE]
         kept = poses["evidence"][:, unused]
         poses = judged_anew(poses, names, sources, fits, network)
@@ -141,7 +147,7 @@ def poses_to_fit(
         written, of = BytesIO(), {"made_of": made_of, "names": names, "used": EVIDENCE}  # used: for what is reported
         np.savez(written, **cast(dict[str, Any], poses | {key: np.array(value) for key, value in of.items()}))
         write_whole(stored, written.getvalue())
-    return poses | {"evidence": poses["evidence"][:, : len(EVIDENCE)]}
+    return told(poses | {"evidence": poses["evidence"][:, : len(EVIDENCE)]})
 
 
 def _read(stored: Path, made_of: str) -> dict[str, np.ndarray]:
@@ -222,7 +228,11 @@ def judged_anew(
             searched[search.row] = search.on_device
             found = poses["T_camera_object"][rows]
             _check(bool((poses["object"][rows] == search.number).all()))
-            _check(np.allclose(search.errors(found[:1], search.image.errors), poses["error"][rows[:1]], atol=1e-4))
+            _check(
+                np.allclose(
+                    search.errors(found[:1], search.image.errors), poses["error"][rows[:1]], atol=1e-4, equal_nan=True
+                )
+            )
             seen = picture_evidence(found, search.on_device, search.scene, config.agreement)
             evidence[np.ix_(rows, of_picture)] = seen
     _check(set(poses["search"].tolist()) == set(searched))

@@ -41,6 +41,12 @@ def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return poses | {"error": poses["largest_error"]}
 
 
+def told(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return those poses of which it is known whether they are right."""
+    known = ~np.isnan(poses["error"])
+    return {column: values[known] for column, values in poses.items()}
+
+
 def held_out_models(
     poses: dict[str, np.ndarray], options: FitOptions
 ) -> Iterator[tuple[Int[np.ndarray, " o"], Calibration]]:
@@ -57,8 +63,9 @@ def _folds(poses: dict[str, np.ndarray], options: FitOptions) -> list[Int[np.nda
 
 
 def model_of(poses: dict[str, np.ndarray], options: FitOptions) -> Calibration:
-    """Return the model that is fitted to poses, of one member if any of them is as it was found."""
+    """Return the model that is fitted to those poses that are `told`, of one member if any is as it was found."""
     members = options.members if poses["refined"].all() else 1  # one is enough to choose what is refined
+    poses = told(poses)
     right, weights = poses["error"] < THRESHOLD, _weights(poses, options)
     return fit_calibration(poses["evidence"], right, EVIDENCE, weights, members=members)
 
@@ -85,8 +92,8 @@ class Fitted(NamedTuple):
 def fit(poses: dict[str, np.ndarray], options: FitOptions) -> Fitted:
     """Fit a model of evidence.
 
-    Where some poses are those that detection reports, the scale of the model is fitted to them, as models of other
-    objects predict them, and they are what is judged.
+    Of all poses it must be `told` whether they are right. Where some are those that detection reports, the scale of the
+    model is fitted to them, as models of other objects predict them, and they are what is judged.
     """
     right = poses["error"] < THRESHOLD
     held_out = np.zeros(len(right))

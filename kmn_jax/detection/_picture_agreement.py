@@ -73,6 +73,9 @@ class PictureAgreement(NamedTuple):
     raised: Scalar  # mean height of that surface above the plane, seen from the camera, at most half a diameter
     surrounded: Scalar  # of the whole surface: inside of what is measured around it, see `_beside_outline`
     buried_between: Scalar  # buried, where each point of the surface counts as much as it is surrounded
+    beside: Scalar  # what surrounds it: measured, and not in front
+    uneven: Scalar  # root mean square of how far that is off its plane, in depth and diameters, each by 0.5 at most
+    buried_deep: Scalar  # buried by more than what surrounds it is uneven; by less than 2% more it counts in part
 
 
 class _Predicted(NamedTuple):
@@ -233,19 +236,23 @@ def _beside_outline(
 
     Where cells all lie to one side, the plane beyond them is anybody's guess. So each point is surrounded in full up to
     one standard deviation of the cells from their middle, and farther away, at d of these, by 1 / d^2: by a half on a
-    ring of cells.
+    ring of cells. Among the uneven neighbours of a pile the plane says little, too.
     """
-    plane = fit_plane(found.depth, around, seen.nearest)
+    plane, some = fit_plane(found.depth, around, seen.nearest), around.any()
     z = jnp.maximum(seen.surface[:, 2], 1e-6 * diameter)
     x, y = ((seen.surface[:, axis] / z - first[0, 0]) / seen.pitch for axis, first in ((0, seen.u), (1, seen.v)))
-    height = jnp.where(around.any(), (plane.depth(x, y) - z) / diameter, 0)
+    height = jnp.where(some, (plane.depth(x, y) - z) / diameter, 0)
+    off = jnp.clip((plane.depth(*places_of(found.depth)) - found.depth) / diameter, -_RAISED, _RAISED)
+    uneven = jnp.sqrt(jnp.where(around, off**2, 0).sum() / jnp.maximum(around.sum(dtype=jnp.float32), 1))
     below = jnp.clip(-height / _BELOW, 0, 1)
-    between = jnp.where(around.any(), 1 / jnp.maximum(plane.closeness.away(x, y), 1), 0)
+    between = jnp.where(some, 1 / jnp.maximum(plane.closeness.away(x, y), 1), 0)
     return {
         "buried": below.mean(),
         "raised": jnp.clip(height, -_RAISED, _RAISED).mean(),
         "surrounded": between.mean(),
         "buried_between": (between * below).mean(),
+        "uneven": uneven,
+        "buried_deep": jnp.clip((-height - uneven) / _BELOW, 0, 1).mean(),
     }
 
 
@@ -299,5 +306,6 @@ def _outline(seen: _Predicted, found: _Measured, compared: Bool[Array, "s s"], d
         "level": share(level),
         "fronted": share(fronted),
         "coplanar": share(coplanar),
+        "beside": share(there & ~fronted),
         **_beside_outline(seen, found, there & ~fronted, diameter),
     }

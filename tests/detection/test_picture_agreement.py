@@ -72,6 +72,7 @@ def test_a_box_on_a_floor_is_above_it_and_one_in_it_is_buried(depth: jax.Array, 
     assert above.buried < 0.01
     assert below.buried > 0.6  # all but the front and the upper edges of the sides
     assert above.surrounded > 0.8
+    assert max(above.uneven, below.uneven) < 0.01
     assert above.buried_between < 0.01
     assert 0.2 < below.buried_between < below.surrounded  # what is in front of the box hides it, and is not around it
     height = SIZES[2] / 2 / down[2] / PART.diameter  # of the middle, along the line of sight
@@ -83,6 +84,24 @@ def test_without_surroundings_nothing_is_buried(depth: jax.Array) -> None:
         found = of(POSES[0], nothing)
         assert (found.buried, found.raised) == (0, 0)
         assert (found.surrounded, found.buried_between) == (0, 0)
+        assert (found.beside, found.uneven, found.buried_deep) == (0, 0, 0)
+
+
+def test_beside_uneven_neighbours_a_box_is_less_deep_than_in_a_floor() -> None:
+    # Flush with a floor, and with one of tiles of which every second one lies lower by the height of the box.
+    T = pose((0.0, 0.0, WALL + SIZES[2] / 2))
+    x, y = directions()
+    tile = SIZES[0] / WALL / 3
+    steps = np.where((np.floor(x / tile) + np.floor(y / tile)) % 2 == 0, 0.0, SIZES[2])
+    box = (np.abs(x) * WALL < SIZES[0] / 2) & (np.abs(y) * WALL < SIZES[1] / 2)
+    even, uneven = (
+        of(T, jnp.asarray(np.where(box, WALL, WALL + off), dtype=jnp.float32)) for off in (np.zeros_like(steps), steps)
+    )
+    assert even.uneven < 1e-3
+    assert even.buried_deep > 0.9 * even.buried > 0.5
+    assert 0.3 * SIZES[2] < uneven.uneven * PART.diameter < 0.7 * SIZES[2]
+    assert uneven.buried_deep < 0.3 * uneven.buried
+    assert even.beside > 0.95
 
 
 def test_beside_a_slope_that_is_all_there_is_hardly_anything_is_known_to_be_buried(depth: jax.Array) -> None:

@@ -276,6 +276,35 @@ def test_a_search_is_explored_as_by_detection(monkeypatch: pytest.MonkeyPatch, m
     assert module._first_seeds(search) == (scene, "foreground", "stranger")
 
 
+def test_a_stranger_that_looks_like_the_part_is_neither_right_nor_wrong() -> None:
+    alike = np.array([False, True])
+
+    def looks_like(part: str, poses: np.ndarray) -> np.ndarray:
+        assert part == "stranger"
+        np.testing.assert_array_equal(poses[:, :3, 3], [[5, 1, 0]] * 2)  # in the scene's frame
+        return alike
+
+    image: Any = SimpleNamespace(part="own", looks_like=looks_like)
+    T_scene_camera = np.array([[0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float32)
+    scene: Any = SimpleNamespace(T_scene_camera=T_scene_camera)
+    poses = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
+    poses[:, 0, 3] = 1.0
+    nothing: Any = None
+    search = module.Search(image, "stranger", nothing, scene, 0, 7, False)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(search.errors(poses, nothing), [np.inf, np.nan])
+    own = search._replace(part=image.part)
+    np.testing.assert_array_equal(own.errors(poses, lambda given: given[:, :2, 3]), [1, 1])
+    np.testing.assert_array_equal(own.errors(poses, lambda given: given[:, :1, 3]), [5, 5])
+
+
+@pytest.mark.usefixtures("searched")
+def test_poses_that_are_neither_right_nor_wrong_are_stored_alone(tmp_path: Path, network: Model) -> None:
+    path = tmp_path / "poses.npz"
+    store(path, network, error=np.array([0.01, 0.01, np.nan, 0.01, 0.01, 0.01]))
+    poses = poses_to_fit(Sources(), FitOptions(), network, path)
+    np.testing.assert_array_equal(poses["T_camera_object"][:, 0, 3], [0, 1, 3, 4, 5])
+
+
 def test_another_method_does_not_replace_what_is_shipped() -> None:
     with pytest.raises(InputError, match="--output"):
         calibrate(Options(method="FPFH"))

@@ -102,6 +102,17 @@ def test_an_object_with_four_times_the_poses_counts_twice() -> None:
     np.testing.assert_allclose(first, 3 * second)
 
 
+def test_poses_of_which_it_is_not_known_whether_they_are_right_do_not_count() -> None:
+    poses = drawn(0)
+    rng = np.random.default_rng(1)
+    unknown = rng.random(len(poses["error"])) < 0.3
+    poses["error"] = np.where(unknown, np.nan, poses["error"])
+    others = fits.told(poses)
+    assert all(len(values) == (~unknown).sum() for values in others.values())
+    misled = poses | {"evidence": np.where(unknown[:, None], 9.0, poses["evidence"])}
+    assert fits.model_of(misled, FitOptions()) == fits.model_of(others, FitOptions())
+
+
 def test_poses_of_one_object_predict_no_other() -> None:
     with pytest.raises(InputError, match="0 of 0 poses are right"):
         fit(drawn(0, 1), FitOptions(members=1))
