@@ -8,9 +8,9 @@ variant_...
                step, of seven runs at once nearly seven.
     Expected:  after 128,000 samples validation losses of 2.32 (reference), 2.31 (points_1024), 2.21 (wide), 2.42
                (dynamic) and 2.33 (invariant). In a pack that was built in part, of 1,267 objects for training, 2.35
-               (reference), 2.27 (neighbors_20), 2.50 (narrow), and of 20 keypoints 1.77 (keypoints_20); in training 2.43
-               (reference) and, of as many keypoints, 2.82 (keypoints_128) and 3.61 (keypoints_512). docs/training.md
-               has recalls.
+               (reference), 2.27 (neighbors_20), 2.50 (narrow), and of 20 keypoints 1.77 (keypoints_20); in training
+               2.43 (reference) and, of as many keypoints, 2.82 (keypoints_128) and 3.61 (keypoints_512).
+               docs/training.md has recalls.
 
 wide_long, dynamic_long
     The two that found more, trained for long: wide_long from random parameters, dynamic_long from those of `small`, as
