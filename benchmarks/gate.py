@@ -1,6 +1,6 @@
 """Whether anything has become slower: ratios of ours over plain forms in the same run, beside a committed baseline.
 
-python -m benchmarks.gate [--update] [--repeats 9] [--json FILE]
+python -m benchmarks.gate [--update] [--repeats 5] [--json FILE]
 
 Ratios, as milliseconds of a busy or another machine say nothing; loose, as ratios vary there too. `--update` writes the
 baseline anew, on a machine with nothing else to do.
@@ -43,7 +43,7 @@ class Pair(NamedTuple):
     plain: Callable[[], Any]
 
 
-def main(update: bool = False, repeats: int = 9, json: Path | None = None) -> int:
+def main(update: bool = False, repeats: int = 5, json: Path | None = None) -> int:
     """Compare, and return 1 if a ratio has fallen too far.
 
     Args:
