@@ -16,7 +16,7 @@ COMPILE := .venv-lock/bin/uv --no-config pip compile --quiet --generate-hashes -
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test check format bench load bench-env compile-env newest attack docs lock platforms clean
+.PHONY: help demo test check format bench load bench-env browser compile-env newest attack docs lock platforms clean
 
 help: ## list these verbs
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' Makefile
@@ -47,6 +47,8 @@ load: $(READY) ## send 1,000 scans from 8 clients to a server on this machine: a
 	$(BIN)/python -m benchmarks.serve --scans 1000 --clients 8
 
 bench-env: $(BENCH_READY) ## add PyTorch, for the benchmarks and the tests marked torch
+
+browser: $(BROWSER_SOUGHT) ## look for a browser for the tests of the page of results, as make test does
 
 compile-env: $(COMPILE_READY) ## add compilers for GPUs and TPUs that are not here (gigabytes), for benchmarks.compiled
 

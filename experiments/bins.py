@@ -17,7 +17,7 @@ from experiments.test_sets import SPLIT
 from experiments.worlds import NAMES, TARGETS, has_other_parts, kind_of
 from kmn_jax.bop import BopDataset, BopFrame, BopInstance, FrameKey
 from kmn_jax.data import load_models
-from kmn_jax.detection import Scene, bin_content, make_scene, near_surface, symmetry_transforms
+from kmn_jax.detection import Scene, bin_content, into, make_scene, near_surface, symmetry_transforms
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import measured_points
 from kmn_jax.io import Scan
@@ -68,18 +68,17 @@ class TrueImage:
         near, least = _ALIKE[0] * other.diameter, _ALIKE[1]
         points = [part.points[:_SHARED_POINTS] for part in (other, self.part)]
         trees = [cKDTree(part.points) for part in (self.part, other)]  # the surface that the points are to lie on
-        found, true = (
-            pose[:, :3, :3] @ of.mean(axis=0) + pose[:, :3, 3]
-            for pose, of in zip((poses, self.truth), points, strict=True)
-        )
-        is_near = np.linalg.norm(found[:, None] - true[None], axis=2) < 0.5 * (other.diameter + self.part.diameter)
+        middles = [of.mean(axis=0) for of in points]
+        found = poses[:, :3, :3] @ middles[0] + poses[:, :3, 3]
+        copies = self.truth[:, :3, :3] @ middles[1] + self.truth[:, :3, 3]
+        is_near = np.linalg.norm(found[:, None] - copies[None], axis=2) < 0.5 * (other.diameter + self.part.diameter)
         result = np.zeros(len(poses), dtype=bool)
         for row, copy in np.argwhere(is_near):
             T_own_other = np.linalg.inv(self.truth[copy]) @ poses[row]
-            moves = T_own_other, np.linalg.inv(T_own_other)
+            moved = into(np.linalg.inv(T_own_other), points[0]), into(T_own_other, points[1])
             result[row] |= all(
-                np.isfinite(tree.query(of @ move[:3, :3].T + move[:3, 3], distance_upper_bound=near)[0]).mean() >= least
-                for tree, of, move in zip(trees, points, moves, strict=True)
+                np.isfinite(tree.query(of, distance_upper_bound=near)[0]).mean() >= least
+                for tree, of in zip(trees, moved, strict=True)
             )
         return result
 

@@ -228,11 +228,8 @@ def judged_anew(
             searched[search.row] = search.on_device
             found = poses["T_camera_object"][rows]
             _check(bool((poses["object"][rows] == search.number).all()))
-            _check(
-                np.allclose(
-                    search.errors(found[:1], search.image.errors), poses["error"][rows[:1]], atol=1e-4, equal_nan=True
-                )
-            )
+            error = search.errors(found[:1], search.image.errors)
+            _check(np.allclose(error, poses["error"][rows[:1]], atol=1e-4, equal_nan=True))
             seen = picture_evidence(found, search.on_device, search.scene, config.agreement)
             evidence[np.ix_(rows, of_picture)] = seen
     _check(set(poses["search"].tolist()) == set(searched))

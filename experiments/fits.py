@@ -119,9 +119,10 @@ def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], 
     """
     logits = logits[poses["reported"]]
     poses = {name: values[poses["reported"]] for name, values in poses.items()}
-    right, columns, together = poses["error"] < THRESHOLD, np.zeros((len(logits), 2)), poses["narrowed"].copy()
-    for search in np.unique(poses["search"]):
-        rows = np.flatnonzero(poses["search"] == search)
+    right, together = poses["error"] < THRESHOLD, poses["narrowed"].copy()
+    rows_of = [np.flatnonzero(poses["search"] == search) for search in np.unique(poses["search"])]
+    columns = np.zeros((len(logits), len(COMPANY)))
+    for rows in rows_of:
         columns[rows] = company(logits[rows])
         together[rows] &= len(rows) > 1
     if not together.any():
@@ -135,9 +136,9 @@ def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], 
         own = together & np.isin(poses["object"], names)
         if own.any():
             others = of_company(together & ~own)
-            for search in np.unique(poses["search"][own]):
-                rows = np.flatnonzero(poses["search"] == search)
-                held_out[rows] = vouched(logits[rows], others)
+            for rows in rows_of:
+                if own[rows].any():
+                    held_out[rows] = vouched(logits[rows], others)
     return Fitted(of_company(together), held_out, _judged(poses, held_out))
 
 
