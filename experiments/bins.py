@@ -29,7 +29,6 @@ from kmn_jax.simulate import Bin
 _UNIT = "mm"
 _POINTS = 1000  # of an object's surface, for errors
 _SHARED_POINTS = 500  # of it, to see which share lies on another
-_STRANGERS = 2  # of an image
 THRESHOLD = 0.1  # of the diameter: a pose with less ADI is right
 _ALIKE = 0.03, 2 / 3  # diameters of a stranger, within which such a share of either surface lies on the other
 LEAST_VISIBLE = 0.3  # share of a copy that is seen, from which on it ought to be found
@@ -41,7 +40,7 @@ class TrueImage:
 
     key: FrameKey
     part: Part
-    strangers: tuple[Part, ...]  # of about the same size, the nearest first; that there is no copy of them is known
+    strangers: tuple[Part, ...]  # the nearest in size first, one a kind; that there is no copy of them is known
     truth: Float[np.ndarray, "i 4 4"]
     visible: Float[np.ndarray, " i"]  # share of each copy that is seen
 
@@ -223,7 +222,7 @@ def _like_in_size(part: Part, others: Iterable[tuple[Hashable, Part]]) -> tuple[
     nearest: dict[Hashable, Part] = {}
     for kind, other in sorted(others, key=lambda pair: abs(np.log(pair[1].diameter / part.diameter))):
         nearest.setdefault(kind, other)
-    return tuple(nearest.values())[:_STRANGERS]
+    return tuple(nearest.values())
 
 
 def _scan(frame: BopFrame) -> Scan:

@@ -25,9 +25,10 @@ from typing import Annotated, Any
 
 import tyro
 
-from experiments.candidates import Sources, poses_to_fit
+from experiments.candidates import poses_to_fit
 from experiments.fits import FitOptions, by_largest_error, fit, fit_together
 from experiments.reliability_picture import save_reliability
+from experiments.searches import Sources
 from kmn_jax.detection import Probabilities, calibration_beside, load_lightgbm, probabilities_bytes
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from io import BytesIO
-from itertools import count
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, cast
 from zipfile import BadZipFile
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
-from tqdm import tqdm
+from jaxtyping import Bool, Float32, Int
 
-from experiments.bins import TrueImage, WorldImage, bin_images, world_images
 from experiments.fits import FitOptions, by_largest_error, held_out_models, model_of, told
 from experiments.fpfh import fpfh_poses
-from experiments.test_sets import SPLIT
+from experiments.searches import SEARCHED, Search, Sources, searches
 from kmn_jax.detection import (
     EVIDENCE,
     PICTURE_EVIDENCE,
@@ -30,12 +27,9 @@ from kmn_jax.detection import (
     Clock,
     DetectConfig,
     DevicePart,
-    Scene,
     SearchConfig,
     chosen,
-    device_part,
     explore,
-    make_scene,
     picture_evidence,
     refined_candidates,
     search_at,
@@ -43,9 +37,8 @@ from kmn_jax.detection import (
 )
 from kmn_jax.errors import InputError, shown
 from kmn_jax.files import write_whole
-from kmn_jax.io import Scan
 from kmn_jax.models import Model
-from kmn_jax.objects import Part, model_digest
+from kmn_jax.objects import model_digest
 
 _LOOSE = DetectConfig(reported=0.03)  # refines more than detection does, so that the fit sees what is just refused
 _COLUMNS = (  # of what is stored
@@ -60,68 +53,18 @@ _COLUMNS = (  # of what is stored
     "due",  # whether they are of what detection chooses among, which refines less; of parts that are not known
     "reported",
 )
-_MARGINS = (0.1, 0.4)  # diameters: so much of what is around copies is left in scans that are cut out
-_HOW = 4  # version of how is collected: it goes up with what is searched, of what and from where, and what is right
-_KINDS = 100  # more than the families of parts in a folder of world bins
+_HOW = 5  # version of how is collected: it goes up with what is kept of a search, and what is right
+_IN_MEMORY = 600  # searches, of each of which what was found first, crops and all, takes 10 MB
+_AT_ONCE = 2  # searches: one alone leaves a part of two cores idle
+
+Columns = dict[str, np.ndarray]
 
 
-@dataclass(frozen=True)
-class Sources:
-    """How and in which images is searched."""
-
-    method: Literal["kmn_jax", "FPFH"] = "kmn_jax"
-    bins: Path = Path("outputs/validation_bins")  # folder with datasets in BOP format
-    worlds: Path | None = None  # folder of world bins to fit on, too: outputs/worlds/validation
-    known_worlds: Path | None = None  # the same, of parts that the network was trained with: no scale is fitted to it
-    every: int = 1  # use every so many images of `bins`
-    judge_anew: bool = False  # compute what depth images show of stored poses again, as after a change of that code
-
-
-class Search(NamedTuple):
-    """One image and the part that is searched in it."""
-
-    image: TrueImage
-    part: Part  # the image's own, or a stranger
-    on_device: DevicePart
-    scene: Scene
-    row: int  # of all searches
-    number: int  # that searches of one object, or of one family of parts, share
-    is_known: bool  # whether the network was trained with such parts
-
-    def columns(self, found: Candidates) -> dict[str, np.ndarray]:
-        """Return evidence, errors and object of poses."""
-        poses = found.T_camera_object[found.usable]
-        error = self.errors(poses, self.image.errors)
-        is_own = self.part is self.image.part
-        return {
-            "evidence": found.evidence[found.usable],
-            "error": error,
-            "largest_error": self.errors(poses, self.image.largest_errors) if is_own else error,
-            "object": np.full(len(poses), self.number),
-            "search": np.full(len(poses), self.row),
-            "narrowed": np.full(len(poses), self.scene.is_narrowed),
-            "T_camera_object": poses,  # to judge it by other evidence
-        }
-
-    def errors(
-        self, T_camera_object: Float32[np.ndarray, "s 4 4"], measure: Callable[[np.ndarray], np.ndarray]
-    ) -> Float[np.ndarray, " s"]:
-        """Return by how much poses are off the nearest copy: of a part that is not there infinitely.
-
-        It is NaN where such a part hardly differs from the copy that it is found at: neither right nor wrong.
-        """
-        poses = self.scene.T_scene_camera @ T_camera_object
-        if self.part is not self.image.part:
-            return np.where(self.image.looks_like(self.part, poses), np.nan, np.inf)
-        return measure(poses).min(axis=1, initial=np.inf)
-
-
-def poses_to_fit(
-    sources: Sources, fits: FitOptions, network: Model, stored: Path | None = None
-) -> dict[str, np.ndarray]:
+def poses_to_fit(sources: Sources, fits: FitOptions, network: Model, stored: Path | None = None) -> Columns:
     """Return evidence, outcome, object and search of all poses, and whether they are refined, and what is judged.
 
-    What is `stored` is not searched again; what is searched is written there. Where what depth images show is wanted
+    What is `stored` is not searched again; what is searched is written there, and before that search by search into a
+    folder beside it, from which goes on what was ended, or wants more images. Where what depth images show is wanted
     anew, or other kinds of it, stored poses are judged anew, and stored with that: those that are refined stay the ones
     that were chosen by the evidence of before, and evidence that is not used any more is kept. Raises InputError if
     what is stored is of other bins, weights or settings, or lacks evidence that comes of crops.
@@ -129,7 +72,7 @@ def poses_to_fit(
     made_of = _made_of(sources, fits, network)
     names: tuple[str, ...] = EVIDENCE
     if stored is None or not stored.exists():
-        poses = collect(sources, fits, network)
+        poses = collect(sources, fits, network, stored and stored.with_suffix(".searches"))
     else:
         poses = _read(stored, made_of)
         names, used = (tuple(poses.pop(key).tolist()) for key in ("names", "used"))
@@ -144,60 +87,122 @@ def poses_to_fit(
         poses["evidence"] = np.concatenate([poses["evidence"], kept], axis=1)
         names = (*EVIDENCE, *(names[column] for column in unused))
     if stored is not None:
-        written, of = BytesIO(), {"made_of": made_of, "names": names, "used": EVIDENCE}  # used: for what is reported
-        np.savez(written, **cast(dict[str, Any], poses | {key: np.array(value) for key, value in of.items()}))
-        write_whole(stored, written.getvalue())
+        of = {"made_of": made_of, "names": names, "used": EVIDENCE}  # used: for what is reported
+        _write(stored, poses | {key: np.array(value) for key, value in of.items()})
     return told(poses | {"evidence": poses["evidence"][:, : len(EVIDENCE)]})
 
 
-def _read(stored: Path, made_of: str) -> dict[str, np.ndarray]:
+def _read(stored: Path, made_of: str) -> Columns:
     """Return what is stored. Raises InputError if it is something else."""
-    try:
-        with np.load(stored) as file:
-            poses = dict(file)
-    except (OSError, EOFError, ValueError, TypeError, BadZipFile) as error:
-        raise InputError(f"{stored} holds no poses ({shown(error)}): remove it") from None
+    poses = _loaded(stored)
     if str(poses.pop("made_of", "")) != made_of or set(poses) != {*_COLUMNS, "names", "used"}:
         raise InputError(f"{stored} holds poses of other bins, weights or settings: remove it")
     return poses
 
 
-def collect(sources: Sources, fits: FitOptions, network: Model) -> dict[str, np.ndarray]:
-    """Search and refine.
+def _loaded(path: Path) -> Columns:
+    try:
+        with np.load(path) as file:
+            return dict(file)
+    except (OSError, EOFError, ValueError, TypeError, BadZipFile) as error:
+        raise InputError(f"{path} holds no poses ({shown(error)}): remove it") from None
+
+
+def _write(path: Path, columns: Columns) -> None:
+    written = BytesIO()
+    np.savez(written, **cast(dict[str, Any], columns))
+    write_whole(path, written.getvalue())
+
+
+def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | None = None) -> Columns:
+    """Search and refine, and keep what each search found in a folder, if one is given.
 
     First around the seeds that detection begins with, which the model of poses as they are found is fitted to. Then,
     by such models that do not know the image's object, as detection does, round after round: where little is found most
     is wrong. Of parts that the network knows, no scale is fitted to which, only what was found first is refined. Images
-    are read twice, as they do not all fit into memory; what was found first does.
+    are read twice, as they do not all fit into memory. Raises InputError if the folder is of other weights or settings.
     """
     config = DetectConfig().search_of(network.config)
     first: dict[int, Candidates] = {}
-    parts = []
-    for search in _searches(sources, network):
-        found = _propose(search, network, config, sources.method)(_first_seeds(search))
-        parts.append(search.columns(found))
-        first[search.row] = _with_poses(found) if search.is_known else found  # which is gone on from, crops and all
-    poses = _joined(parts)
+    kept = _Kept(folder, repr((_HOW, sources.method, model_digest(network), _settings(network))))
+
+    def propose(search: Search) -> Callable[[Int[np.ndarray, " c"]], Candidates]:
+        return _propose(search, network, config, sources.method)
+
+    def found_first(search: Search) -> Columns:
+        found = propose(search)(_first_seeds(search))
+        if len(first) < _IN_MEMORY:
+            first[search.row] = _with_poses(found) if search.is_known else found
+        return search.columns(found)
+
+    poses = _joined(_side_by_side(partial(kept.made, "found", found_first), searches(sources, network)))
     none = np.zeros(len(poses["error"]), dtype=bool)
     poses |= {"refined": none, "due": none, "reported": none}
     others, of_all = _models(poses, fits), model_of(poses, fits)
-    parts, searched = [], {}
-    for search in _searches(sources, network):
-        found, chooser = first.pop(search.row), of_all
+    searched: dict[int, DevicePart] = {}
+
+    def refined(search: Search) -> Columns:
+        found, chooser = first.pop(search.row, None) or propose(search)(_first_seeds(search)), of_all
         if not search.is_known:
             chooser = others.get(search.number, of_all)  # of an object without poses no model knows anything
-            found = _explored(search, _going_on(found, _propose(search, network, config, sources.method)), chooser)
+            found = _explored(search, _going_on(found, propose(search)), chooser)
         choice = chosen(found, chooser, search.on_device, _LOOSE)
         rows = np.flatnonzero(choice.kept | choice.contenders)
-        if len(rows):
+        if not len(rows):
+            return search.columns(found._replace(usable=np.zeros_like(found.usable))) | {"due": np.zeros(0, dtype=bool)}
+        fine = refined_candidates(search.on_device, search.scene, found, rows, 0, config)
+        none = np.zeros(np.count_nonzero(fine.usable), dtype=bool)
+        due = none if search.is_known else _due(found, chooser, search.on_device, rows, fine)
+        return search.columns(fine) | {"due": due}
+
+    def refined_part(search: Search) -> Columns:
+        found = kept.made("refined", refined, search)
+        if len(found["error"]):
             searched[search.row] = search.on_device
-            fine = refined_candidates(search.on_device, search.scene, found, rows, 0, config)
-            none = np.zeros(np.count_nonzero(fine.usable), dtype=bool)
-            due = none if search.is_known else _due(found, chooser, search.on_device, rows, fine)
-            parts.append(search.columns(fine) | {"due": due})
-    more = _joined(parts)
+        return found
+
+    more = _joined(_side_by_side(refined_part, searches(sources, network)))
     none = np.zeros(len(more["error"]), dtype=bool)
     return _with_reported(_joined([poses, more | {"refined": ~none, "reported": none}]), searched, fits)
+
+
+class _Kept:
+    """What searches found, in a folder or nowhere."""
+
+    def __init__(self, folder: Path | None, made_of: str) -> None:
+        self._folder = folder
+        if folder is None:
+            return
+        told = folder / "made_of.txt"
+        if not folder.exists():
+            folder.mkdir(parents=True)
+            write_whole(told, made_of.encode())
+        if not told.is_file() or told.read_text(encoding="utf-8") != made_of:
+            raise InputError(f"{folder} holds searches by other weights or settings: remove it")
+
+    def made(self, stage: str, make: Callable[[Search], Columns], search: Search) -> Columns:
+        """Return what a stage makes of a search, or made of it before."""
+        if self._folder is None:
+            return make(search)
+        path = self._folder / f"{search.name}-{stage}.npz"
+        if path.exists():
+            columns = _loaded(path)
+        else:
+            columns = make(search)
+            _write(path, columns)
+        return columns | {"search": np.full(len(columns["error"]), search.row)}  # which may be another one today
+
+
+def _side_by_side(function: Callable[[Search], Columns], items: Iterable[Search]) -> list[Columns]:
+    """Return what a function makes of items, some of which it is given at once."""
+    results: list[Columns] = []
+    running: deque[Future[Columns]] = deque()
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        for item in items:
+            running.append(pool.submit(function, item))
+            if len(running) > _AT_ONCE:  # no more are read in advance
+                results.append(running.popleft().result())
+        return [*results, *(one.result() for one in running)]
 
 
 def _due(
@@ -209,9 +214,7 @@ def _due(
     return np.tile(due, len(fine.usable) // len(rows))[fine.usable]
 
 
-def judged_anew(
-    poses: dict[str, np.ndarray], names: tuple[str, ...], sources: Sources, fits: FitOptions, network: Model
-) -> dict[str, np.ndarray]:
+def judged_anew(poses: Columns, names: tuple[str, ...], sources: Sources, fits: FitOptions, network: Model) -> Columns:
     """Return poses with the evidence of today: what comes of crops is what they have, by `names`, the rest computed.
 
     Raises InputError if the images are not those that the poses were found in.
@@ -222,7 +225,7 @@ def judged_anew(
             evidence[:, column] = poses["evidence"][:, names.index(name)]
     of_picture = np.array([EVIDENCE.index(name) for name in PICTURE_EVIDENCE])
     config, searched = DetectConfig().search_of(network.config), {}
-    for search in _searches(sources, network):
+    for search in searches(sources, network):
         rows = np.flatnonzero(poses["search"] == search.row)
         if len(rows):
             searched[search.row] = search.on_device
@@ -241,9 +244,7 @@ def _check(is_same: bool) -> None:
         raise InputError("the bins are not those that the stored poses were found in: remove the file")
 
 
-def _with_reported(
-    poses: dict[str, np.ndarray], searched: dict[int, DevicePart], fits: FitOptions
-) -> dict[str, np.ndarray]:
+def _with_reported(poses: Columns, searched: dict[int, DevicePart], fits: FitOptions) -> Columns:
     """Return poses with what detection reports of each search, by models that do not know the image's object."""
     fine = {name: values[poses["refined"]] for name, values in poses.items()}
     others, exact = (_models(rows, fits) for rows in (fine, by_largest_error(fine)))
@@ -257,7 +258,7 @@ def _with_reported(
     return poses | {"reported": reported}
 
 
-def _models(poses: dict[str, np.ndarray], fits: FitOptions) -> dict[int, Calibration]:
+def _models(poses: Columns, fits: FitOptions) -> dict[int, Calibration]:
     """Return for each object the model that is fitted to the poses of others."""
     return {int(name): fitted for names, fitted in held_out_models(poses, fits) for name in names}
 
@@ -268,50 +269,8 @@ def _choosable(poses: Float32[np.ndarray, "s 4 4"], evidence: Float32[np.ndarray
     return Candidates(poses, np.ones(len(poses), dtype=bool), evidence, none, none, cast(Any, None), none)
 
 
-def _joined(columns: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def _joined(columns: list[Columns]) -> Columns:
     return {name: np.concatenate([part[name] for part in columns]) for name in columns[0]}
-
-
-def _searches(sources: Sources, network: Model) -> Iterator[Search]:
-    """Yield all images with their parts, and with one that is known not to be there, if any is.
-
-    What is searched in vain is the part that is nearest in size, and the next one, by turns.
-    """
-    searches = count()
-    for row, (number, image, scene, is_known) in enumerate(_images(sources, network)):
-        for part in (image.part, *image.strangers[row % 2 :][:1]):
-            yield Search(image, part, device_part(network, part), scene, next(searches), number, is_known)
-
-
-def _images(sources: Sources, network: Model) -> Iterator[tuple[int, TrueImage, Scene, bool]]:
-    """Yield all images with their scenes.
-
-    Also yield a number that those of one object share, or of one family of parts, and whether the network knows it.
-    """
-    folders = sorted(path for path in sources.bins.glob("*") if (path / SPLIT).is_dir())
-    if not folders:
-        raise InputError(f"{sources.bins} holds no datasets: python -m experiments.build_data validation-bins")
-    for number, folder in enumerate(folders, start=1):
-        for image in tqdm(bin_images(folder, SPLIT, network, sources.every), unit="image", desc=folder.name):
-            yield 1000 * number + image.key.scene_id, image, image.scene, False
-    for number, world in enumerate((sources.worlds, sources.known_worlds)):
-        if world is None:
-            continue
-        is_known = number == 1
-        for row, found in enumerate(tqdm(world_images(world, network), unit="image", desc=f"worlds {world.name}")):
-            with suppress(InputError):  # a scan without foreground, as of an empty table
-                scene = make_scene(as_given(found, row) if is_known else found.scan, found.part.diameter)
-                yield _KINDS * number + found.kind, found, scene, is_known
-
-
-def as_given(image: WorldImage, row: int) -> Scan:
-    """Return a scan as users may have it: as a depth image, as a cloud, or, if there are any, cut out around copies."""
-    if row % 3 == 0:
-        return image.scan
-    cut = None
-    if row % 3 == 2:
-        cut = image.cloud(np.random.default_rng(row).uniform(*_MARGINS))
-    return cut if cut is not None and len(cut.points) else image.cloud()
 
 
 def _first_seeds(search: Search) -> Int[np.ndarray, " c"]:
@@ -359,6 +318,10 @@ def _with_poses(found: Candidates) -> Candidates:
 def _made_of(sources: Sources, fits: FitOptions, network: Model) -> str:
     """Say what candidates are made of."""
     folders = [str(folder) for folder in (sources.bins, sources.worlds, sources.known_worlds)]
-    settings = DetectConfig(), DetectConfig().search_of(network.config), _LOOSE, _MARGINS
     decisive = fits.folds, fits.members, fits.absent_weight, TREE_SETTINGS  # for what is reported
-    return repr((_HOW, sources.method, folders, sources.every, decisive, model_digest(network), settings))
+    given = SEARCHED, sources.method, folders, sources.every, decisive, model_digest(network)
+    return repr((_HOW, *given, *_settings(network)))
+
+
+def _settings(network: Model) -> tuple[Any, ...]:
+    return DetectConfig(), DetectConfig().search_of(network.config), _LOOSE

@@ -43,6 +43,7 @@ from kmn_jax.report import check_target, print_table, write_json
 
 _CERTAIN = 0.9
 _LESS_PRECISE = 0.9
+_STRANGERS = 2  # of an image, those that are nearest in size
 _MARGIN = 0.2  # diameters, of cut-outs
 _ALL = "all"
 _BUT = ("time of flight", "touching rows")  # families with more than a millimetre of noise, and of one field of parts
@@ -135,7 +136,7 @@ def run(options: Options) -> dict[str, Any]:
             groups = [image.family, _ALL, *([] if image.family in _BUT else [_OTHERS])]
             for name in groups:
                 tallies[name].add(image, counted)
-            for stranger in image.strangers if options.strangers else ():
+            for stranger in image.strangers[:_STRANGERS] if options.strangers else ():
                 _, found = found_in(model, fitted, stranger, scan)
                 for name in groups:
                     tallies[name].add_stranger(found)

@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from kmn_jax.detection._frames import into
+from kmn_jax.detection._frames import into, placed
 from kmn_jax.detection._scene import Scene
 from kmn_jax.detection._search import Candidates
+from kmn_jax.detection._voxels import cell_numbers
 from kmn_jax.objects import Part
 
 # Shares of the object's diameter.
@@ -48,7 +49,7 @@ def cover(
 
     rows = np.flatnonzero(before.left)
     away = before.away.copy()
-    distance, _ = cKDTree(scene.points[found.seed_rows]).query(scene.points[rows])
+    distance, _ = cKDTree(scene.points[found.seed_rows]).query(scene.points[rows], workers=2)
     away[rows] = np.minimum(away[rows], distance)
 
     centers = (found.T_camera_object @ np.append((part.minimum + part.maximum) / 2, 1))[:, :3]
@@ -81,12 +82,12 @@ def near_surface(
     from scipy.spatial import cKDTree
 
     left, tree = np.arange(len(points)), cKDTree(surface)
-    low, high = surface.min(axis=0) - near, surface.max(axis=0) + near
+    middle = (surface.min(axis=0) + surface.max(axis=0)) / 2
+    reach = float(np.linalg.norm(surface - middle, axis=1).max()) + near
     for pose in T_camera_object:
-        local = into(pose, points[left])
-        inside = np.flatnonzero(((local >= low) & (local <= high)).all(axis=1))
-        distance, _ = tree.query(local[inside], distance_upper_bound=near)
-        left = np.delete(left, inside[np.isfinite(distance)])
+        around = np.flatnonzero(((points[left] - placed(pose, middle)) ** 2).sum(axis=1) <= reach**2)
+        distance, _ = tree.query(into(pose, points[left[around]]), distance_upper_bound=near, workers=2)
+        left = np.delete(left, around[np.isfinite(distance)])
     result = np.ones(len(points), dtype=bool)
     result[left] = False
     return result
@@ -105,8 +106,8 @@ def to_search(state: Coverage, scene: Scene, part: Part, patience: int | None) -
 
 def _crowded(chosen: Bool[np.ndarray, " r"], scene: Scene, part: Part) -> Bool[np.ndarray, " r"]:
     rows = np.flatnonzero(chosen)
-    cells = np.floor(scene.points[rows] / (_CELL * part.diameter)).astype(np.int64)
-    _, which, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    cells = cell_numbers(scene.points[rows], _CELL * part.diameter)
+    _, which, counts = np.unique(cells, return_inverse=True, return_counts=True)
     result = np.zeros_like(chosen)
-    result[rows[counts[which.reshape(-1)] >= _LEAST_CROWD]] = True
+    result[rows[counts[which] >= _LEAST_CROWD]] = True
     return result

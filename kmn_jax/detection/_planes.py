@@ -53,7 +53,10 @@ def dominant_plane(
 
     def counts_of(start: int) -> Int[np.ndarray, " c"]:
         some = slice(start, start + _CHUNK)
-        return (np.abs(sample @ normals[some].T - offsets[some]) <= margin).sum(axis=0)
+        away = normals[some] @ sample.T
+        away -= offsets[some, None]
+        near = np.abs(away, out=away) <= margin
+        return np.array([np.count_nonzero(row) for row in near])  # many times as fast as a sum
 
     with ThreadPoolExecutor(2) as pool:  # NumPy lets others run as it counts
         counts = np.concatenate(list(pool.map(counts_of, range(0, len(normals), _CHUNK))))

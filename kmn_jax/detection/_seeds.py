@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from kmn_jax.detection._scene import Scene, nearest_row
+from kmn_jax.detection._voxels import cell_numbers
 from kmn_jax.geometry import PaddedCloud, farthest_point_indices
 from kmn_jax.objects import Part
 from kmn_jax.programs import kept
@@ -25,8 +26,8 @@ def seeds_over(
     capacity = scene.cloud.mask.shape[0]
     flags = jnp.asarray(np.pad(open_points, (0, capacity - len(open_points))))
     rows, real = _spread(scene.cloud, flags, count=NUM_SEEDS)
-    cells = np.floor(scene.points[open_points] / (SPACING * part.diameter)).astype(np.int64)
-    return np.asarray(rows)[np.asarray(real)][: min(most, len(np.unique(cells, axis=0)))]
+    cells = np.unique(cell_numbers(scene.points[open_points], SPACING * part.diameter))
+    return np.asarray(rows)[np.asarray(real)][: min(most, len(cells))]
 
 
 def seeds_at(scene: Scene, places: Float[np.ndarray, "k 3"]) -> Int[np.ndarray, " k"]:

@@ -87,12 +87,15 @@ def scene_size(scan: Scan) -> SceneSize:
 
     generator, points = np.random.default_rng(0), scan.points
     if len(points) > _MOST:
-        points = points[np.unique(generator.integers(0, len(points), _MOST))]
+        drawn = np.zeros(len(points), dtype=bool)
+        drawn[generator.integers(0, len(points), _MOST)] = True
+        points = points[drawn]
     low, high = np.percentile(points.astype(np.float64), _PERCENTILES, axis=0)
     spacing = 0.0
     if len(points) > 1:
         chosen = points if len(points) <= _SAMPLE else generator.choice(points, _SAMPLE, replace=False)
-        nearest = cKDTree(points).query(chosen, k=2)[0][:, 1]
+        tree = cKDTree(points, compact_nodes=False, balanced_tree=False)  # for few questions
+        nearest = tree.query(chosen, k=2, workers=2)[0][:, 1]
         # Fewer points of a surface are farther apart, by the root of their share.
         spacing = float(np.median(nearest)) * math.sqrt(len(points) / len(scan.points))
     distance = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,8 +14,9 @@ import pytest
 
 from experiments import candidates as module
 from experiments.calibrate import Options, calibrate
-from experiments.candidates import Sources, poses_to_fit
+from experiments.candidates import poses_to_fit
 from experiments.fits import FitOptions
+from experiments.searches import Sources
 from kmn_jax.detection import (
     EVIDENCE,
     PICTURE_EVIDENCE,
@@ -78,7 +80,7 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
         assert found.evidence.shape[1] == len(EVIDENCE)
         return SimpleNamespace(kept=np.arange(len(found.usable)) > 0)
 
-    monkeypatch.setattr(module, "_searches", searches)
+    monkeypatch.setattr(module, "searches", searches)
     monkeypatch.setattr(module, "picture_evidence", shown)
     monkeypatch.setattr(module, "held_out_models", models)
     monkeypatch.setattr(module, "chosen", all_but_the_first)
@@ -137,7 +139,7 @@ def test_stored_poses_are_judged_anew_by_other_evidence(
         np.testing.assert_array_equal(stored["evidence"][:, gone], 0)
     assert sorted(tmp_path.iterdir()) == [path]
     with monkeypatch.context() as patch:
-        patch.setattr(module, "_searches", None)  # not once more
+        patch.setattr(module, "searches", None)  # not once more
         again = poses_to_fit(Sources(), FitOptions(), network, path)
     assert again.keys() == poses.keys()
     for name, values in poses.items():
@@ -201,46 +203,59 @@ def test_what_detection_refines_is_told_of_all_forms(monkeypatch: pytest.MonkeyP
     np.testing.assert_array_equal(due, [False, True, False, True, False, False, True, False, True, False, True])
 
 
-def test_unknown_parts_are_searched_as_detection_does_and_known_ones_at_first_seeds(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A search of an unknown part is explored with the model that does not know it, one of a known part is not."""
-    poses = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
+class Asked:
+    """Three searches, of which the third is of a known part, that find what a test can tell apart.
 
-    def searches(sources: Sources, network: Any) -> Any:
-        for row, is_known in enumerate((False, False, True)):
+    Models are named by numbers: of poses as they are found, no model knows anything of the second part.
+    """
 
-            def columns(found: Any, row: int = row) -> dict[str, np.ndarray]:
-                count = len(found.usable)
-                numbers = {"object": 7 + row, "search": row, "error": 0.01, "largest_error": 0.01, "narrowed": False}
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.order = [0, 1, 2]
+        self.proposed: list[int] = []
+        self.chosen_by: list[tuple[int, int]] = []
+        models = {False: {7: 1, 9: 3}, True: {7: 1, 8: 2, 9: 3}}
+        monkeypatch.setattr(module, "searches", self.searches)
+        monkeypatch.setattr(module, "_first_seeds", lambda search: None)
+        monkeypatch.setattr(module, "_propose", lambda search, *given: partial(self.propose, search.scene))
+        monkeypatch.setattr(module, "_explored", lambda search, propose, model: self.found(2, 10.0 + model))
+        monkeypatch.setattr(module, "_with_poses", lambda found: found)
+        monkeypatch.setattr(module, "_models", lambda poses, fits: models[bool(poses["refined"].all())])
+        monkeypatch.setattr(module, "model_of", lambda poses, fits: 5)
+        monkeypatch.setattr(module, "chosen", self.all_of)
+        monkeypatch.setattr(module, "refined_candidates", lambda part, scene, found, *_: found)
+
+    def searches(self, sources: Sources, network: Any) -> Any:
+        for row, own in enumerate(self.order):
+
+            def columns(found: Any, row: int = row, own: int = own) -> dict[str, np.ndarray]:
+                count = int(found.usable.sum())
+                numbers = {"object": 7 + own, "search": row, "error": 0.01, "largest_error": 0.01, "narrowed": False}
                 rows = {name: np.full(count, value) for name, value in numbers.items()}
-                evidence = np.full((count, len(EVIDENCE)), found.evidence[0])
-                return rows | {"evidence": evidence, "T_camera_object": poses[:count]}
+                poses = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1))
+                return rows | {"evidence": np.full((count, len(EVIDENCE)), found.evidence[0]), "T_camera_object": poses}
 
-            yield SimpleNamespace(row=row, on_device=row, scene=row, is_known=is_known, number=7 + row, columns=columns)
+            facts = {"is_known": own == 2, "number": 7 + own, "name": "abc"[own], "columns": columns}
+            yield SimpleNamespace(row=row, on_device=own, scene=own, **facts)
 
-    def found(count: int, evidence: float) -> Any:
-        return SimpleNamespace(usable=np.ones(count, dtype=bool), evidence=np.array([evidence]))
+    def found(self, count: int, evidence: float) -> Any:
+        none: Any = None
+        return Candidates(none, np.ones(count, dtype=bool), np.array([evidence]), none, none, none, none)
 
-    chosen_by = []
+    def propose(self, own: int, rows: Any) -> Any:
+        self.proposed.append(own)
+        return self.found(1, 0.0)
 
-    def all_of(found: Any, model: Any, part: int, config: Any, exact: Any = None) -> Any:
-        chosen_by.append((part, model))
+    def all_of(self, found: Any, model: int, part: int, config: Any, exact: Any = None) -> Any:
+        self.chosen_by.append((part, model))
         count = len(found.usable)
         return SimpleNamespace(kept=np.ones(count, dtype=bool), contenders=np.zeros(count, dtype=bool))
 
-    monkeypatch.setattr(module, "_searches", searches)
-    monkeypatch.setattr(module, "_first_seeds", lambda search: None)
-    monkeypatch.setattr(module, "_propose", lambda *given: lambda rows: found(1, 0.0))
-    monkeypatch.setattr(module, "_explored", lambda search, propose, model: found(2, 10.0 + model))
-    monkeypatch.setattr(module, "_with_poses", lambda found: found)
-    of_found, of_refined = {7: 1, 9: 3}, {7: 1, 8: 2, 9: 3}  # 8 has no pose around the first seeds
-    models = {False: of_found, True: of_refined}
-    monkeypatch.setattr(module, "_models", lambda poses, fits: models[bool(poses["refined"].all())])
-    monkeypatch.setattr(module, "model_of", lambda poses, fits: 5)
-    monkeypatch.setattr(module, "chosen", all_of)
-    monkeypatch.setattr(module, "refined_candidates", lambda part, scene, found, *_: found)
-    network: Any = SimpleNamespace(config=TINY)
+
+def test_unknown_parts_are_searched_as_detection_does_and_known_ones_at_first_seeds(
+    monkeypatch: pytest.MonkeyPatch, network: Model
+) -> None:
+    """A search of an unknown part is explored with the model that does not know it, one of a known part is not."""
+    asked = Asked(monkeypatch)
     result = module.collect(Sources(), FitOptions(), network)
     refined = result["refined"]
     np.testing.assert_array_equal(result["search"][~refined], [0, 1, 2])
@@ -248,7 +263,56 @@ def test_unknown_parts_are_searched_as_detection_does_and_known_ones_at_first_se
     np.testing.assert_array_equal(result["evidence"][refined, 0], [11, 11, 15, 15, 0])
     np.testing.assert_array_equal(result["due"][refined], [True, True, True, True, False])
     np.testing.assert_array_equal(result["reported"], result["due"])
-    assert chosen_by[:5] == [(0, 1), (0, 1), (1, 5), (1, 5), (2, 5)]
+    assert sorted(asked.chosen_by[:5]) == [(0, 1), (0, 1), (1, 5), (1, 5), (2, 5)]
+    assert sorted(asked.proposed) == [0, 1, 2]  # what was found first is kept in memory, ...
+    monkeypatch.setattr(module, "_IN_MEMORY", 0)  # ... or found again
+    again = module.collect(Sources(), FitOptions(), network)
+    assert sorted(asked.proposed[3:]) == [0, 0, 1, 1, 2, 2]
+    for name, values in result.items():
+        np.testing.assert_array_equal(again[name], values)
+
+
+def test_what_was_searched_before_an_end_is_not_searched_again(
+    monkeypatch: pytest.MonkeyPatch, network: Model, tmp_path: Path
+) -> None:
+    asked, folder = Asked(monkeypatch), tmp_path / "searches"
+    asked.order = [0, 2]
+    before = module.collect(Sources(), FitOptions(), network, folder)
+    assert sorted(asked.proposed) == [0, 2]
+    (folder / "c-refined.npz").unlink()
+    asked.order = [1, 0, 2]  # others may come between
+    after = module.collect(Sources(), FitOptions(), network, folder)
+    assert sorted(asked.proposed[2:]) == [1, 2]
+    for name, values in before.items():
+        if name != "search":
+            np.testing.assert_array_equal(after[name][after["search"] != 0], values)
+    np.testing.assert_array_equal(after["search"], [0, 1, 2, 0, 0, 1, 1, 2])
+    count = len(asked.chosen_by)
+    module.collect(Sources(), FitOptions(), network, folder)
+    assert len(asked.proposed) == 4
+    assert asked.chosen_by[count:] == [(1, 2), (0, 1)]  # for what is reported alone
+    (folder / "b-found.npz").write_bytes(b"no numbers")
+    with pytest.raises(InputError, match=r"b-found.npz holds no poses .*: remove it"):
+        module.collect(Sources(), FitOptions(), network, folder)
+    with pytest.raises(InputError, match="holds searches by other weights or settings: remove it"):
+        module.collect(Sources(method="FPFH"), FitOptions(), network, folder)
+
+
+def test_a_search_that_finds_nothing_is_kept_as_well(
+    monkeypatch: pytest.MonkeyPatch, network: Model, tmp_path: Path
+) -> None:
+    asked = Asked(monkeypatch)
+
+    def all_but_one(found: Any, model: int, part: int, config: Any, exact: Any = None) -> Any:
+        kept = asked.all_of(found, model, part, config, exact)
+        kept.kept &= part != 0
+        return kept
+
+    monkeypatch.setattr(module, "chosen", all_but_one)
+    for _ in range(2):
+        result = module.collect(Sources(), FitOptions(), network, tmp_path / "searches")
+        np.testing.assert_array_equal(result["search"][result["refined"]], [1, 1, 2])
+    assert sorted(asked.proposed) == [0, 1, 2]
 
 
 @pytest.mark.parametrize("method", ["kmn_jax", "FPFH"])
@@ -274,27 +338,6 @@ def test_a_search_is_explored_as_by_detection(monkeypatch: pytest.MonkeyPatch, m
     assert module._explored(search, propose, named["chooser"]) == wanted[method]
     assert asked == [(scene, "stranger", "chooser", DetectConfig())]
     assert module._first_seeds(search) == (scene, "foreground", "stranger")
-
-
-def test_a_stranger_that_looks_like_the_part_is_neither_right_nor_wrong() -> None:
-    alike = np.array([False, True])
-
-    def looks_like(part: str, poses: np.ndarray) -> np.ndarray:
-        assert part == "stranger"
-        np.testing.assert_array_equal(poses[:, :3, 3], [[5, 1, 0]] * 2)  # in the scene's frame
-        return alike
-
-    image: Any = SimpleNamespace(part="own", looks_like=looks_like)
-    T_scene_camera = np.array([[0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float32)
-    scene: Any = SimpleNamespace(T_scene_camera=T_scene_camera)
-    poses = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
-    poses[:, 0, 3] = 1.0
-    nothing: Any = None
-    search = module.Search(image, "stranger", nothing, scene, 0, 7, False)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(search.errors(poses, nothing), [np.inf, np.nan])
-    own = search._replace(part=image.part)
-    np.testing.assert_array_equal(own.errors(poses, lambda given: given[:, :2, 3]), [1, 1])
-    np.testing.assert_array_equal(own.errors(poses, lambda given: given[:, :1, 3]), [5, 5])
 
 
 @pytest.mark.usefixtures("searched")
@@ -332,18 +375,6 @@ def motor() -> DevicePart:
     arrays = PartArrays(points, normals, jnp.zeros((128, 1)), jnp.float32(1.2))
     surfels = Surfels(points, normals, jnp.float32(2.5))
     return DevicePart(arrays, surfels, jnp.eye(4)[None], jnp.float32(0.1), jnp.eye(4)[None], jnp.zeros(1, bool))
-
-
-def test_each_image_is_searched_for_its_part_and_for_a_stranger_of_two_by_turns(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    strangers = [("a", "b"), ("c", "d"), (), ("e",), ("f",)]
-    images = [(7, SimpleNamespace(part=f"own {row}", strangers=of), "scene", False) for row, of in enumerate(strangers)]
-    monkeypatch.setattr(module, "_images", lambda sources, network: images)
-    monkeypatch.setattr(module, "device_part", lambda network, part: None)
-    searches: list[Any] = list(module._searches(Sources(), "network"))  # type: ignore[arg-type]
-    assert [search.part for search in searches] == ["own 0", "a", "own 1", "d", "own 2", "own 3", "own 4", "f"]
-    assert [search.row for search in searches] == list(range(8))
 
 
 def test_what_was_searched_before_is_not_searched_again() -> None:

@@ -14,7 +14,6 @@ import pytest
 
 from experiments import detect_worlds
 from experiments.bins import LEAST_VISIBLE, WorldImage, _like_in_size, world_images
-from experiments.candidates import as_given
 from experiments.detect_bins import Tally
 from experiments.detect_worlds import WorldTally, scan_of
 from experiments.test_sets import SPLIT
@@ -107,13 +106,6 @@ def test_scans_are_cut_out_around_copies(images: list[WorldImage]) -> None:
     assert not len(images[3].cloud(0.1).points)
 
 
-def test_known_worlds_are_given_as_scans_come(images: list[WorldImage]) -> None:
-    assert as_given(images[0], 0) is images[0].scan
-    sizes = [len(as_given(images[0], row).points) for row in (1, 2)]
-    assert sizes[0] == len(images[0].scan.points) > sizes[1] > 0
-    assert len(as_given(images[3], 2).points) == len(images[3].scan.points)  # without a copy nothing is cut
-
-
 def test_worlds_are_given_in_the_form_that_is_asked_for(images: list[WorldImage]) -> None:
     present, absent = images[0], images[3]
     assert scan_of(present, "images") is present.scan
@@ -189,7 +181,7 @@ def test_the_worst_images_are_drawn(images: list[WorldImage], tmp_path: Path) ->
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in drawn)
 
 
-def test_strangers_are_the_parts_of_two_other_kinds_that_are_nearest_in_size() -> None:
+def test_strangers_are_the_parts_of_other_kinds_that_are_nearest_in_size() -> None:
     parts: dict[str, Any] = {
         name: SimpleNamespace(diameter=size) for name, size in zip("abcd", (9, 12, 8, 40), strict=True)
     }

@@ -1,0 +1,166 @@
+"""What probabilities are fitted to: images whose truth is known, and the parts that are searched in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from itertools import count
+from pathlib import Path
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from jaxtyping import Float, Float32
+from tqdm import tqdm
+
+from experiments.bins import BinImage, TrueImage, WorldImage, bin_images, world_images
+from experiments.test_sets import SPLIT
+from kmn_jax.detection import Candidates, DevicePart, Scene, device_part, make_scene
+from kmn_jax.errors import InputError
+from kmn_jax.io import Scan
+from kmn_jax.models import Model
+from kmn_jax.objects import Part
+
+Form = Literal["image", "cloud", "cut-out"]  # what users may have: depth images, clouds, clouds of what is near copies
+_FORMS: tuple[Form, ...] = get_args(Form)
+_MARGINS = (0.1, 0.4)  # diameters: so much of what is around copies is left in scans that are cut out
+_STRANGERS = 3  # that are searched in each image, of twice as many that are nearest in size, by turns
+_KINDS = 100  # more than the families of parts in a folder of world bins
+SEARCHED = 5, _FORMS, _MARGINS, _STRANGERS  # version of what is searched, and from where, and what decides it
+
+
+@dataclass(frozen=True)
+class Sources:
+    """How and in which images is searched."""
+
+    method: Literal["kmn_jax", "FPFH"] = "kmn_jax"
+    bins: Path = Path("outputs/validation_bins")  # folder with datasets in BOP format
+    worlds: Path | None = None  # folder of world bins to fit on, too: outputs/worlds/validation
+    known_worlds: Path | None = None  # the same, of parts that the network was trained with: no scale is fitted to it
+    every: int = 1  # use every so many images of `bins`
+    judge_anew: bool = False  # compute what depth images show of stored poses again, as after a change of that code
+
+
+class Search(NamedTuple):
+    """One image and the part that is searched in it."""
+
+    image: TrueImage
+    part: Part  # the image's own, or a stranger
+    on_device: DevicePart
+    scene: Scene
+    row: int  # of all searches
+    number: int  # that searches of one object, or of one family of parts, share
+    is_known: bool  # whether the network was trained with such parts
+    name: str  # of its own, whatever else is searched
+
+    def columns(self, found: Candidates) -> dict[str, np.ndarray]:
+        """Return evidence, errors and object of poses."""
+        poses = found.T_camera_object[found.usable]
+        error = self.errors(poses, self.image.errors)
+        is_own = self.part is self.image.part
+        return {
+            "evidence": found.evidence[found.usable],
+            "error": error,
+            "largest_error": self.errors(poses, self.image.largest_errors) if is_own else error,
+            "object": np.full(len(poses), self.number),
+            "search": np.full(len(poses), self.row),
+            "narrowed": np.full(len(poses), self.scene.is_narrowed),
+            "T_camera_object": poses,  # to judge it by other evidence
+        }
+
+    def errors(
+        self, T_camera_object: Float32[np.ndarray, "s 4 4"], measure: Callable[[np.ndarray], np.ndarray]
+    ) -> Float[np.ndarray, " s"]:
+        """Return by how much poses are off the nearest copy: of a part that is not there infinitely.
+
+        It is NaN where such a part hardly differs from the copy that it is found at: neither right nor wrong.
+        """
+        poses = self.scene.T_scene_camera @ T_camera_object
+        if self.part is not self.image.part:
+            return np.where(self.image.looks_like(self.part, poses), np.nan, np.inf)
+        return measure(poses).min(axis=1, initial=np.inf)
+
+
+class _Image(NamedTuple):
+    """One image, and how its scan may be given."""
+
+    name: str
+    number: int  # see `Search`
+    image: TrueImage
+    scene: Callable[[Form], Scene]  # raises InputError if there is nothing to search, as on an empty table
+    is_known: bool
+
+
+def searches(sources: Sources, network: Model) -> Iterator[Search]:
+    """Yield all images with their parts, and with some that are known not to be there, if any are.
+
+    What is searched in vain are the parts that are nearest in size, every second one of them, those that are left out
+    in the next image. The scan is given in other forms by turns, where it may be, see `_asked`.
+    """
+    numbers = count()
+    for row, (name, number, image, scene, is_known) in enumerate(_images(sources, network)):
+        for part, form in _asked(image, row, is_known):
+            with suppress(InputError):
+                given = f"{name}-{part.name}-{form}"
+                yield Search(
+                    image, part, device_part(network, part), scene(form), next(numbers), number, is_known, given
+                )
+
+
+def _asked(image: TrueImage, row: int, is_known: bool) -> Iterator[tuple[Part, Form]]:
+    """Yield what is searched in an image, and in which form of its scan.
+
+    Bins are given as images. Of worlds so are the part and the first stranger, and again the part and other strangers
+    in other forms; those of known parts have one form each, and one stranger: of them nothing is judged.
+    """
+    parts = image.part, *image.strangers[row % 2 :: 2][:_STRANGERS]
+    forms = [_FORMS[(row + turn) % len(_FORMS)] for turn in range(len(parts))]
+    if not isinstance(image, WorldImage):
+        yield from ((part, "image") for part in parts)
+    elif is_known:
+        yield from ((part, forms[0]) for part in parts[:2])
+    else:
+        yield from ((part, "image" if turn < 2 else forms[turn]) for turn, part in enumerate(parts))
+        yield image.part, _FORMS[1 + row % 2]
+
+
+def _images(sources: Sources, network: Model) -> Iterator[_Image]:
+    folders = sorted(path for path in sources.bins.glob("*") if (path / SPLIT).is_dir())
+    if not folders:
+        raise InputError(f"{sources.bins} holds no datasets: python -m experiments.build_data validation-bins")
+    for number, folder in enumerate(folders, start=1):
+        for image in tqdm(bin_images(folder, SPLIT, network, sources.every), unit="image", desc=folder.name):
+            yield _Image(_name(folder, image), 1000 * number + image.key.scene_id, image, _scene_of(image), False)
+    for number, world in enumerate((sources.worlds, sources.known_worlds)):
+        if world is None:
+            continue
+        for row, found in enumerate(tqdm(world_images(world, network), unit="image", desc=f"worlds {world.name}")):
+            scene = _scene_of_world(found, row)
+            yield _Image(_name(world, found), _KINDS * number + found.kind, found, scene, number == 1)
+
+
+def _name(folder: Path, image: TrueImage) -> str:
+    return f"{folder.parent.name}-{folder.name}-{image.key.scene_id:06d}-{image.key.image_id:06d}"
+
+
+def _scene_of(image: BinImage) -> Callable[[Form], Scene]:
+    return lambda form: image.scene
+
+
+def _scene_of_world(image: WorldImage, row: int) -> Callable[[Form], Scene]:
+    @cache
+    def scene(form: Form) -> Scene:
+        return make_scene(as_given(image, form, row), image.part.diameter)
+
+    return scene
+
+
+def as_given(image: WorldImage, form: Form, random_seed: int) -> Scan:
+    """Return a scan as users may have it; what has no copies to be cut out around is the cloud."""
+    if form == "image":
+        return image.scan
+    cut = None
+    if form == "cut-out":
+        cut = image.cloud(np.random.default_rng(random_seed).uniform(*_MARGINS))
+    return cut if cut is not None and len(cut.points) else image.cloud()
