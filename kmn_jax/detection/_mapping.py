@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any, TypeVar, cast
 
 import jax
@@ -26,31 +25,17 @@ def map_rows(function: Callable[..., _Result], *items: Any) -> _Result:
 
 
 def map_real(function: Callable[..., _Result], real: Bool[Array, " s"], *items: Any) -> _Result:
-    """Map a function over leading axes, inside of jit, to zeros where `real` is false: on CPUs these take no time.
+    """Map a function over leading axes, inside of jit, to zeros where `real` is false: on CPUs these are skipped.
 
     Accelerators call it anyway: their host would have to wait to know whether.
     """
     first = jax.tree.map(lambda leaf: leaf[0], items)
-    shapes = jax.eval_shape(function, *first)
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, *first))
 
-    def in_turn(real: Bool[Array, " s"], *items: Any) -> _Result:
-        def step(state: tuple[Bool[Array, " s"], _Result]) -> tuple[Bool[Array, " s"], _Result]:
-            left, results = state
-            row = jnp.argmax(left)
-            new = function(*jax.tree.map(lambda leaf: leaf[row], items))
-            return left.at[row].set(False), jax.tree.map(lambda leaf, one: leaf.at[row].set(one), results, new)
+    def one(real: Bool[Array, ""], *item: Any) -> _Result:
+        return jax.lax.cond(real, function, lambda *item: zeros, *item)
 
-        none = jax.tree.map(lambda leaf: jnp.zeros((len(real), *leaf.shape), leaf.dtype), shapes)
-        return jax.lax.while_loop(lambda state: state[0].any(), step, (real, none))[1]
-
-    def at_once(real: Bool[Array, " s"], *items: Any) -> _Result:
-        def one(real: Bool[Array, ""], *item: Any) -> _Result:
-            zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-            return jax.tree.map(partial(jnp.where, real), function(*item), zeros)
-
-        return jax.vmap(one)(real, *items)
-
-    return jax.lax.platform_dependent(real, *items, cpu=in_turn, default=at_once)
+    return map_rows(one, real, *items)
 
 
 def call_rows(one: Callable[..., _Result], many: Callable[..., _Result], *items: Any) -> _Result:
