@@ -157,7 +157,7 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
 
     def refined_part(search: Search) -> Columns:
         found = kept.made("refined", refined, search)
-        if len(found["error"]):
+        if found and found["due"].any():
             searched[search.row] = search.on_device
         return found
 
@@ -181,12 +181,14 @@ class _Kept:
             raise InputError(f"{folder} holds searches by other weights or settings: remove it")
 
     def made(self, stage: str, make: Callable[[Search], Columns], search: Search) -> Columns:
-        """Return what a stage makes of a search, or made of it before."""
+        """Return what a stage makes of a search, or made of it before; nothing of one that is empty."""
         if self._folder is None:
-            return make(search)
+            return {} if search.is_empty else make(search)
         path = self._folder / f"{search.name}-{stage}.npz"
         if path.exists():
             columns = _loaded(path)
+        elif search.is_empty:
+            return {}
         else:
             columns = make(search)
             _write(path, columns)
@@ -270,6 +272,7 @@ def _choosable(poses: Float32[np.ndarray, "s 4 4"], evidence: Float32[np.ndarray
 
 
 def _joined(columns: list[Columns]) -> Columns:
+    columns = [part for part in columns if part]
     return {name: np.concatenate([part[name] for part in columns]) for name in columns[0]}
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property, partial
 from itertools import count
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
@@ -42,17 +41,36 @@ class Sources:
     judge_anew: bool = False  # compute what depth images show of stored poses again, as after a change of that code
 
 
-class Search(NamedTuple):
-    """One image and the part that is searched in it."""
+@dataclass(frozen=True)
+class Search:
+    """One image and the part that is searched in it. What searching takes is made when it is asked for."""
 
     image: TrueImage
     part: Part  # the image's own, or a stranger
-    on_device: DevicePart
-    scene: Scene
+    device_part: Callable[[], DevicePart]
+    make_scene: Callable[[], Scene]  # raises InputError if there is nothing to search, as on an empty table
     row: int  # of all searches
     number: int  # that searches of one object, or of one family of parts, share
     is_known: bool  # whether the network was trained with such parts
     name: str  # of its own, whatever else is searched
+
+    @cached_property
+    def on_device(self) -> DevicePart:
+        """The part on the device."""
+        return self.device_part()
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scan as it is searched. Raises InputError if there is nothing to search."""
+        return self.make_scene()
+
+    @cached_property
+    def is_empty(self) -> bool:
+        """Whether there is nothing to search."""
+        try:
+            return self.scene is None
+        except InputError:
+            return True
 
     def columns(self, found: Candidates) -> dict[str, np.ndarray]:
         """Return evidence, errors and object of poses."""
@@ -85,7 +103,7 @@ class Search(NamedTuple):
 class _Image(NamedTuple):
     """One image, and how its scan may be given."""
 
-    name: str
+    folder: str  # its name
     number: int  # see `Search`
     image: TrueImage
     scene: Callable[[Form], Scene]  # raises InputError if there is nothing to search, as on an empty table
@@ -99,13 +117,18 @@ def searches(sources: Sources, network: Model) -> Iterator[Search]:
     in the next image. The scan is given in other forms by turns, where it may be, see `_asked`.
     """
     numbers = count()
-    for row, (name, number, image, scene, is_known) in enumerate(_images(sources, network)):
+    parts: dict[tuple[str, str], DevicePart] = {}
+
+    def on_device(folder: str, part: Part) -> DevicePart:
+        if (folder, part.name) not in parts:
+            parts[folder, part.name] = device_part(network, part)
+        return parts[folder, part.name]
+
+    for row, (folder, number, image, scene, is_known) in enumerate(_images(sources, network)):
         for part, form in _asked(image, row, is_known):
-            with suppress(InputError):
-                given = f"{name}-{part.name}-{form}"
-                yield Search(
-                    image, part, device_part(network, part), scene(form), next(numbers), number, is_known, given
-                )
+            name = f"{folder}-{image.key.scene_id:06d}-{image.key.image_id:06d}-{part.name}-{form}"
+            given = partial(on_device, folder, part), partial(scene, form)
+            yield Search(image, part, *given, next(numbers), number, is_known, name)
 
 
 def _asked(image: TrueImage, row: int, is_known: bool) -> Iterator[tuple[Part, Form]]:
@@ -131,17 +154,17 @@ def _images(sources: Sources, network: Model) -> Iterator[_Image]:
         raise InputError(f"{sources.bins} holds no datasets: python -m experiments.build_data validation-bins")
     for number, folder in enumerate(folders, start=1):
         for image in tqdm(bin_images(folder, SPLIT, network, sources.every), unit="image", desc=folder.name):
-            yield _Image(_name(folder, image), 1000 * number + image.key.scene_id, image, _scene_of(image), False)
+            yield _Image(_name(folder), 1000 * number + image.key.scene_id, image, _scene_of(image), False)
     for number, world in enumerate((sources.worlds, sources.known_worlds)):
         if world is None:
             continue
         for row, found in enumerate(tqdm(world_images(world, network), unit="image", desc=f"worlds {world.name}")):
             scene = _scene_of_world(found, row)
-            yield _Image(_name(world, found), _KINDS * number + found.kind, found, scene, number == 1)
+            yield _Image(_name(world), _KINDS * number + found.kind, found, scene, number == 1)
 
 
-def _name(folder: Path, image: TrueImage) -> str:
-    return f"{folder.parent.name}-{folder.name}-{image.key.scene_id:06d}-{image.key.image_id:06d}"
+def _name(folder: Path) -> str:
+    return f"{folder.parent.name}-{folder.name}"
 
 
 def _scene_of(image: BinImage) -> Callable[[Form], Scene]:

@@ -234,7 +234,8 @@ class Asked:
                 poses = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1))
                 return rows | {"evidence": np.full((count, len(EVIDENCE)), found.evidence[0]), "T_camera_object": poses}
 
-            facts = {"is_known": own == 2, "number": 7 + own, "name": "abc"[own], "columns": columns}
+            facts = {"is_known": own == 2, "number": 7 + own, "name": "abcd"[own], "columns": columns}
+            facts["is_empty"] = own == 3
             yield SimpleNamespace(row=row, on_device=own, scene=own, **facts)
 
     def found(self, count: int, evidence: float) -> Any:
@@ -280,13 +281,13 @@ def test_what_was_searched_before_an_end_is_not_searched_again(
     before = module.collect(Sources(), FitOptions(), network, folder)
     assert sorted(asked.proposed) == [0, 2]
     (folder / "c-refined.npz").unlink()
-    asked.order = [1, 0, 2]  # others may come between
+    asked.order = [1, 0, 3, 2]  # others may come between, and an empty one
     after = module.collect(Sources(), FitOptions(), network, folder)
     assert sorted(asked.proposed[2:]) == [1, 2]
     for name, values in before.items():
         if name != "search":
             np.testing.assert_array_equal(after[name][after["search"] != 0], values)
-    np.testing.assert_array_equal(after["search"], [0, 1, 2, 0, 0, 1, 1, 2])
+    np.testing.assert_array_equal(after["search"], [0, 1, 3, 0, 0, 1, 1, 3])
     count = len(asked.chosen_by)
     module.collect(Sources(), FitOptions(), network, folder)
     assert len(asked.proposed) == 4

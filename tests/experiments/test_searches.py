@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -70,9 +71,11 @@ def test_scans_come_as_users_may_have_them() -> None:
     assert len(as_given(absent, "cut-out", 0).points) == len(absent.scan.points)  # without a copy nothing is cut
 
 
-def test_each_search_has_a_name_of_its_own_and_those_without_a_foreground_are_left_out(
+def test_each_search_has_a_name_of_its_own_and_makes_what_it_takes_when_that_is_asked_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    made: list[str] = []
+
     def scene(name: str) -> Any:
         def given(form: str) -> str:
             if (name, form) == ("second", "cut-out"):
@@ -81,20 +84,36 @@ def test_each_search_has_a_name_of_its_own_and_those_without_a_foreground_are_le
 
         return given
 
-    images = [module._Image(name, 7, world("ab"), scene(name), False) for name in ("first", "second", "third")]
+    def on_device(network: Any, part: Any) -> str:
+        made.append(part.name)
+        return f"{part.name} on device"
+
+    images = [module._Image(name, 7, world("ab"), scene(name), False) for name in ("first", "second", "first")]
+    images[2] = images[2]._replace(image=replace(images[2].image, key=FrameKey(3, 2)))
     monkeypatch.setattr(module, "_images", lambda sources, network: images)
-    monkeypatch.setattr(module, "device_part", lambda network, part: part.name)
+    monkeypatch.setattr(module, "device_part", on_device)
     network: Any = None
     found = list(searches(Sources(), network))
-    assert [search.row for search in found] == list(range(8))
-    assert [(search.name, search.on_device, search.scene) for search in found[:6]] == [
-        ("first-own-image", "own", "first as image"),
-        ("first-a-image", "a", "first as image"),
-        ("first-own-cloud", "own", "first as cloud"),
-        ("second-own-image", "own", "second as image"),
-        ("second-b-image", "b", "second as image"),
-        ("third-own-image", "own", "third as image"),
+    assert [search.row for search in found] == list(range(9))
+    assert [search.name for search in found[:7]] == [
+        "first-000003-000001-own-image",
+        "first-000003-000001-a-image",
+        "first-000003-000001-own-cloud",
+        "second-000003-000001-own-image",
+        "second-000003-000001-b-image",
+        "second-000003-000001-own-cut-out",
+        "first-000003-000002-own-image",
     ]
+    assert not made
+    assert [str(search.scene) for search in (*found[:5], found[6])] == [
+        *("first as image", "first as image", "first as cloud", "second as image", "second as image"),
+        "first as image",
+    ]
+    assert [search.is_empty for search in found] == [row == 5 for row in range(9)]
+    assert [str(search.on_device) for search in found[:4]] == [
+        f"{name} on device" for name in ("own", "a", "own", "own")
+    ]
+    assert made == ["own", "a", "own"]  # once of each folder
 
 
 def test_a_stranger_that_looks_like_the_part_is_neither_right_nor_wrong() -> None:
@@ -111,8 +130,8 @@ def test_a_stranger_that_looks_like_the_part_is_neither_right_nor_wrong() -> Non
     poses = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
     poses[:, 0, 3] = 1.0
     nothing: Any = None
-    search = Search(image, "stranger", nothing, scene, 0, 7, False, "name")  # type: ignore[arg-type]
+    search = Search(image, "stranger", nothing, lambda: scene, 0, 7, False, "name")  # type: ignore[arg-type]
     np.testing.assert_array_equal(search.errors(poses, nothing), [np.inf, np.nan])
-    own = search._replace(part=image.part)
+    own = replace(search, part=image.part)
     np.testing.assert_array_equal(own.errors(poses, lambda given: given[:, :2, 3]), [1, 1])
     np.testing.assert_array_equal(own.errors(poses, lambda given: given[:, :1, 3]), [5, 5])
