@@ -23,6 +23,7 @@ from kmn_jax.errors import InputError
 from kmn_jax.geometry import measured_points
 from kmn_jax.io import Scan
 from kmn_jax.objects import Part
+from kmn_jax.programs import call_in_place
 from kmn_jax.report import print_table, write_json
 
 
@@ -76,6 +77,7 @@ def _row(estimator: PoseEstimator, part: Part, given: Scan | Scene, repeats: int
 
 
 if __name__ == "__main__":
+    call_in_place()
     try:
         tyro.cli(main)
     except InputError as error:

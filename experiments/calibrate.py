@@ -2,18 +2,20 @@
 
 Poses are searched in the validation bins (`python -m experiments.build_data validation-bins`), whose objects the
 network was not trained with, and with `--worlds` and `--known-worlds` in the whole scans of world bins; in each image
-also a part of about the same size that is known not to be there, if any is; where it hardly differs from a copy, its
-pose is neither right nor wrong, and left out. Of the known worlds two thirds of the scans are given as clouds, half of
-these cut out around the copies, as scans often come. A model of the evidence is fitted to whether they are right.
-Probabilities are also predicted by models that were fitted without the image's object, which gives the reliability that
-is printed. The model of poses as they are found is fitted first, to those around the seeds that detection begins with.
-Then each search is made as a whole, round after round, by such a model that does not know the image's object, and what
-it refines is what the model of refined poses is fitted to: of known worlds, from which no scale is taken, the first
-round alone. Of refined poses detection reports one for each place: the one that a third model holds for the most
-probable, which is fitted to whether all points are in their places (MSSD), and not their mean (ADI). Models are too
-sure of themselves about kinds of objects that they were not fitted to: so the scales of the refined poses' models are
-fitted to what detection would report by models that do not know the kind. From the same poses, of scans of which is
-known where parts are, a fourth model learns what poses of one scene say about each other.
+also up to three parts of about the same size that are known not to be there; where one hardly differs from a copy, its
+pose is neither right nor wrong, and left out. Worlds are given as depth images, as clouds, and as clouds that are cut
+out around the copies, as scans often come: those of known parts by turns, the others as images and again otherwise. It
+takes hours: name a file by `--candidates`, and what was searched before it is ended, with Ctrl+C, is not searched
+again. A model of the evidence is fitted to whether they are right. Probabilities are also predicted by models that were
+fitted without the image's object, which gives the reliability that is printed. The model of poses as they are found is
+fitted first, to those around the seeds that detection begins with. Then each search is made as a whole, round after
+round, by such a model that does not know the image's object, and what it refines is what the model of refined poses is
+fitted to: of known worlds, from which no scale is taken, the first round alone. Of refined poses detection reports one
+for each place: the one that a third model holds for the most probable, which is fitted to whether all points are in
+their places (MSSD), and not their mean (ADI). Models are too sure of themselves about kinds of objects that they were
+not fitted to: so the scales of the refined poses' models are fitted to what detection would report by models that do
+not know the kind. From the same poses, of scans of which is known where parts are, a fourth model learns what poses of
+one scene say about each other.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from kmn_jax.detection import Probabilities, calibration_beside, load_lightgbm, 
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
 from kmn_jax.models import PRETRAINED, load_model, load_pretrained
+from kmn_jax.programs import call_in_place
 from kmn_jax.released import RELEASED
 from kmn_jax.report import check_target, print_table, write_json
 
@@ -45,7 +48,7 @@ class Options(FitOptions, Sources):
 
     model: Annotated[Path | None, tyro.conf.Positional] = None  # .safetensors; the released model unless given
     output: Path | None = None  # the calibration; beside the model unless given
-    candidates: Path | None = None  # .npz file to keep the poses in, which need not be searched again then
+    candidates: Path | None = None  # .npz file to keep the poses in, and a folder beside it
     json: Path | None = None
     picture: Path | None = None  # .png file for the reliability diagram
 
@@ -81,7 +84,13 @@ def calibrate(options: Options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
+    call_in_place()
+    given = tyro.cli(Options)
     try:
-        calibrate(tyro.cli(Options))
+        calibrate(given)
     except InputError as problem:
         sys.exit(f"error: {problem}")
+    except KeyboardInterrupt:
+        sys.exit(
+            "ended: " + ("the same command goes on" if given.candidates else "--candidates FILE keeps what is found")
+        )

@@ -53,7 +53,7 @@ _COLUMNS = (  # of what is stored
     "due",  # whether they are of what detection chooses among, which refines less; of parts that are not known
     "reported",
 )
-_HOW = 5  # version of how is collected: it goes up with what is kept of a search, and what is right
+_HOW = 5  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
 _IN_MEMORY = 600  # searches, of each of which what was found first, crops and all, takes 10 MB
 _AT_ONCE = 2  # searches: one alone leaves a part of two cores idle
 
@@ -72,13 +72,16 @@ def poses_to_fit(sources: Sources, fits: FitOptions, network: Model, stored: Pat
     made_of = _made_of(sources, fits, network)
     names: tuple[str, ...] = EVIDENCE
     if stored is None or not stored.exists():
-        poses = collect(sources, fits, network, stored and stored.with_suffix(".searches"))
+        poses = collect(sources, fits, network, stored and stored.with_name(f"{stored.name}.searches"))
     else:
         poses = _read(stored, made_of)
         names, used = (tuple(poses.pop(key).tolist()) for key in ("names", "used"))
         lacking = sorted(set(EVIDENCE) - {*names, *PICTURE_EVIDENCE})
         if lacking:
-            raise InputError(f"{stored} lacks {', '.join(lacking)}, which comes of crops: remove it, to search again")
+            raise InputError(
+                f"{stored} lacks {', '.join(lacking)}, which comes of crops: remove it and {stored.name}.searches, to"
+                " search again"
+            )
         if used == EVIDENCE and not sources.judge_anew:
             return told(poses | {"evidence": poses["evidence"][:, [names.index(name) for name in EVIDENCE]]})
         unused = [column for column, name in enumerate(names) if name not in EVIDENCE]
@@ -120,11 +123,14 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
     First around the seeds that detection begins with, which the model of poses as they are found is fitted to. Then,
     by such models that do not know the image's object, as detection does, round after round: where little is found most
     is wrong. Of parts that the network knows, no scale is fitted to which, only what was found first is refined. Images
-    are read twice, as they do not all fit into memory. Raises InputError if the folder is of other weights or settings.
+    are read twice, as they do not all fit into memory. What is in the folder stays as it is, chosen by the models of
+    when it was refined: of images that were built anew make another one. Raises InputError if the folder is of other
+    weights or settings.
     """
     config = DetectConfig().search_of(network.config)
     first: dict[int, Candidates] = {}
-    kept = _Kept(folder, repr((_HOW, sources.method, model_digest(network), _settings(network))))
+    kept = _Kept(folder, repr((_HOW, SEARCHED, sources.method, *_settings(fits, network), EVIDENCE)))
+    at_once = 1 if sources.method == "FPFH" else _AT_ONCE  # whose random numbers are those of the whole process
 
     def propose(search: Search) -> Callable[[Int[np.ndarray, " c"]], Candidates]:
         return _propose(search, network, config, sources.method)
@@ -135,7 +141,8 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
             first[search.row] = _with_poses(found) if search.is_known else found
         return search.columns(found)
 
-    poses = _joined(_side_by_side(partial(kept.made, "found", found_first), searches(sources, network)))
+    found_parts = _side_by_side(partial(kept.made, "found", found_first), searches(sources, network), at_once)
+    poses = _joined(found_parts)
     none = np.zeros(len(poses["error"]), dtype=bool)
     poses |= {"refined": none, "due": none, "reported": none}
     others, of_all = _models(poses, fits), model_of(poses, fits)
@@ -161,7 +168,7 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
             searched[search.row] = search.on_device
         return found
 
-    more = _joined(_side_by_side(refined_part, searches(sources, network)))
+    more = _joined(_side_by_side(refined_part, searches(sources, network), at_once))
     none = np.zeros(len(more["error"]), dtype=bool)
     return _with_reported(_joined([poses, more | {"refined": ~none, "reported": none}]), searched, fits)
 
@@ -178,7 +185,7 @@ class _Kept:
             folder.mkdir(parents=True)
             write_whole(told, made_of.encode())
         if not told.is_file() or told.read_text(encoding="utf-8") != made_of:
-            raise InputError(f"{folder} holds searches by other weights or settings: remove it")
+            raise InputError(f"{folder} holds searches by other weights or settings, or other evidence: remove it")
 
     def made(self, stage: str, make: Callable[[Search], Columns], search: Search) -> Columns:
         """Return what a stage makes of a search, or made of it before; nothing of one that is empty."""
@@ -195,16 +202,22 @@ class _Kept:
         return columns | {"search": np.full(len(columns["error"]), search.row)}  # which may be another one today
 
 
-def _side_by_side(function: Callable[[Search], Columns], items: Iterable[Search]) -> list[Columns]:
+def _side_by_side(
+    function: Callable[[Search], Columns], items: Iterable[Search], at_once: int = _AT_ONCE
+) -> list[Columns]:
     """Return what a function makes of items, some of which it is given at once."""
     results: list[Columns] = []
     running: deque[Future[Columns]] = deque()
-    with ThreadPoolExecutor(_AT_ONCE) as pool:
-        for item in items:
-            running.append(pool.submit(function, item))
-            if len(running) > _AT_ONCE:  # no more are read in advance
-                results.append(running.popleft().result())
-        return [*results, *(one.result() for one in running)]
+    with ThreadPoolExecutor(at_once) as pool:
+        try:
+            for item in items:
+                running.append(pool.submit(function, item))
+                if len(running) > at_once:  # no more are read in advance
+                    results.append(running.popleft().result())
+            return [*results, *(one.result() for one in running)]
+        except BaseException:
+            pool.shutdown(cancel_futures=True)  # what runs ends, and is kept
+            raise
 
 
 def _due(
@@ -321,10 +334,9 @@ def _with_poses(found: Candidates) -> Candidates:
 def _made_of(sources: Sources, fits: FitOptions, network: Model) -> str:
     """Say what candidates are made of."""
     folders = [str(folder) for folder in (sources.bins, sources.worlds, sources.known_worlds)]
-    decisive = fits.folds, fits.members, fits.absent_weight, TREE_SETTINGS  # for what is reported
-    given = SEARCHED, sources.method, folders, sources.every, decisive, model_digest(network)
-    return repr((_HOW, *given, *_settings(network)))
+    return repr((_HOW, SEARCHED, sources.method, folders, sources.every, *_settings(fits, network)))
 
 
-def _settings(network: Model) -> tuple[Any, ...]:
-    return DetectConfig(), DetectConfig().search_of(network.config), _LOOSE
+def _settings(fits: FitOptions, network: Model) -> tuple[Any, ...]:
+    decisive = fits.folds, fits.members, fits.absent_weight, TREE_SETTINGS  # for what is refined and reported
+    return decisive, model_digest(network), DetectConfig(), DetectConfig().search_of(network.config), _LOOSE

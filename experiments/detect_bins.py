@@ -49,6 +49,7 @@ from kmn_jax.detection import (
 from kmn_jax.errors import InputError
 from kmn_jax.models import Model, load_model, load_pretrained
 from kmn_jax.pose import LEFT_OUT, RIGHT, THRESHOLDS, WRONG, average_precision, match_copies
+from kmn_jax.programs import call_in_place
 from kmn_jax.report import check_target, print_table, write_json
 
 CONFIG = DetectConfig()
@@ -243,6 +244,7 @@ def _found(name: str, model: Model, fitted: Probabilities, image: BinImage) -> D
 
 
 if __name__ == "__main__":
+    call_in_place()
     try:
         run(tyro.cli(Options))
     except InputError as problem:

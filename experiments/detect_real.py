@@ -24,6 +24,7 @@ from kmn_jax.bop import FrameKey
 from kmn_jax.detection import PoseEstimator
 from kmn_jax.errors import InputError
 from kmn_jax.io import Scan, read_scan
+from kmn_jax.programs import call_in_place
 from kmn_jax.released import RELEASED
 from kmn_jax.report import check_target, print_table, write_json
 from kmn_jax.units import check_unit
@@ -118,6 +119,7 @@ def run(options: Options) -> list[dict[str, Any]]:
 
 
 if __name__ == "__main__":
+    call_in_place()
     try:
         run(tyro.cli(Options))
     except InputError as problem:

@@ -39,6 +39,7 @@ from kmn_jax.errors import InputError
 from kmn_jax.io import Scan
 from kmn_jax.models import Model, load_model, load_pretrained
 from kmn_jax.objects import Part
+from kmn_jax.programs import call_in_place
 from kmn_jax.report import check_target, print_table, write_json
 
 _CERTAIN = 0.9
@@ -174,6 +175,7 @@ def found_in(
 
 
 if __name__ == "__main__":
+    call_in_place()
     try:
         run(tyro.cli(Options))
     except InputError as problem:

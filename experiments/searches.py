@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from itertools import count
 from pathlib import Path
+from threading import Lock
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -47,7 +48,7 @@ class Search:
 
     image: TrueImage
     part: Part  # the image's own, or a stranger
-    device_part: Callable[[], DevicePart]
+    make_part: Callable[[], DevicePart]
     make_scene: Callable[[], Scene]  # raises InputError if there is nothing to search, as on an empty table
     row: int  # of all searches
     number: int  # that searches of one object, or of one family of parts, share
@@ -57,7 +58,7 @@ class Search:
     @cached_property
     def on_device(self) -> DevicePart:
         """The part on the device."""
-        return self.device_part()
+        return self.make_part()
 
     @cached_property
     def scene(self) -> Scene:
@@ -68,9 +69,10 @@ class Search:
     def is_empty(self) -> bool:
         """Whether there is nothing to search."""
         try:
-            return self.scene is None
+            _ = self.scene
         except InputError:
             return True
+        return False
 
     def columns(self, found: Candidates) -> dict[str, np.ndarray]:
         """Return evidence, errors and object of poses."""
@@ -104,6 +106,7 @@ class _Image(NamedTuple):
     """One image, and how its scan may be given."""
 
     folder: str  # its name
+    row: int  # of its images that are used
     number: int  # see `Search`
     image: TrueImage
     scene: Callable[[Form], Scene]  # raises InputError if there is nothing to search, as on an empty table
@@ -116,35 +119,46 @@ def searches(sources: Sources, network: Model) -> Iterator[Search]:
     What is searched in vain are the parts that are nearest in size, every second one of them, those that are left out
     in the next image. The scan is given in other forms by turns, where it may be, see `_asked`.
     """
-    numbers = count()
+    rows = count()
     parts: dict[tuple[str, str], DevicePart] = {}
+    lock = Lock()  # searches may run side by side
 
     def on_device(folder: str, part: Part) -> DevicePart:
-        if (folder, part.name) not in parts:
-            parts[folder, part.name] = device_part(network, part)
-        return parts[folder, part.name]
+        with lock:
+            if (folder, part.name) not in parts:
+                parts[folder, part.name] = device_part(network, part)
+            return parts[folder, part.name]
 
-    for row, (folder, number, image, scene, is_known) in enumerate(_images(sources, network)):
-        for part, form in _asked(image, row, is_known):
-            name = f"{folder}-{image.key.scene_id:06d}-{image.key.image_id:06d}-{part.name}-{form}"
-            given = partial(on_device, folder, part), partial(scene, form)
-            yield Search(image, part, *given, next(numbers), number, is_known, name)
+    for given in _images(sources, network):
+        image = given.image
+        for part, form in _asked(image, given.row, given.is_known):
+            yield Search(
+                image,
+                part,
+                make_part=partial(on_device, given.folder, part),
+                make_scene=partial(given.scene, form),
+                row=next(rows),
+                number=given.number,
+                is_known=given.is_known,
+                name=f"{given.folder}-{image.key.scene_id:06d}-{image.key.image_id:06d}-{part.name}-{form}",
+            )
 
 
 def _asked(image: TrueImage, row: int, is_known: bool) -> Iterator[tuple[Part, Form]]:
-    """Yield what is searched in an image, and in which form of its scan.
+    """Yield what is searched in an image, one of many in its folder, and in which form of its scan.
 
     Bins are given as images. Of worlds so are the part and the first stranger, and again the part and other strangers
-    in other forms; those of known parts have one form each, and one stranger: of them nothing is judged.
+    in other forms; those of known parts have one form each, and one stranger: of them nothing is judged. Half of the
+    cut-outs of the part itself fall on images without it, and are clouds.
     """
     parts = image.part, *image.strangers[row % 2 :: 2][:_STRANGERS]
-    forms = [_FORMS[(row + turn) % len(_FORMS)] for turn in range(len(parts))]
     if not isinstance(image, WorldImage):
         yield from ((part, "image") for part in parts)
     elif is_known:
-        yield from ((part, forms[0]) for part in parts[:2])
+        yield from ((part, _FORMS[row % len(_FORMS)]) for part in parts[:2])
     else:
-        yield from ((part, "image" if turn < 2 else forms[turn]) for turn, part in enumerate(parts))
+        yield from ((part, "image") for part in parts[:2])
+        yield from ((part, _FORMS[(row + turn) % len(_FORMS)]) for turn, part in enumerate(parts[2:]))
         yield image.part, _FORMS[1 + row % 2]
 
 
@@ -153,14 +167,15 @@ def _images(sources: Sources, network: Model) -> Iterator[_Image]:
     if not folders:
         raise InputError(f"{sources.bins} holds no datasets: python -m experiments.build_data validation-bins")
     for number, folder in enumerate(folders, start=1):
-        for image in tqdm(bin_images(folder, SPLIT, network, sources.every), unit="image", desc=folder.name):
-            yield _Image(_name(folder), 1000 * number + image.key.scene_id, image, _scene_of(image), False)
+        bins = tqdm(bin_images(folder, SPLIT, network, sources.every), unit="image", desc=folder.name)
+        for row, image in enumerate(bins):
+            yield _Image(_name(folder), row, 1000 * number + image.key.scene_id, image, _scene_of(image), False)
     for number, world in enumerate((sources.worlds, sources.known_worlds)):
         if world is None:
             continue
         for row, found in enumerate(tqdm(world_images(world, network), unit="image", desc=f"worlds {world.name}")):
             scene = _scene_of_world(found, row)
-            yield _Image(_name(world), _KINDS * number + found.kind, found, scene, number == 1)
+            yield _Image(_name(world), row, _KINDS * number + found.kind, found, scene, number == 1)
 
 
 def _name(folder: Path) -> str:
@@ -172,9 +187,14 @@ def _scene_of(image: BinImage) -> Callable[[Form], Scene]:
 
 
 def _scene_of_world(image: WorldImage, row: int) -> Callable[[Form], Scene]:
-    @cache
+    made: dict[Form, Scene] = {}
+    lock = Lock()  # searches may run side by side
+
     def scene(form: Form) -> Scene:
-        return make_scene(as_given(image, form, row), image.part.diameter)
+        with lock:
+            if form not in made:
+                made[form] = make_scene(as_given(image, form, row), image.part.diameter)
+            return made[form]
 
     return scene
 

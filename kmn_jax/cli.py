@@ -363,9 +363,10 @@ def main(arguments: list[str] | None = None) -> int:
             return 0
         run = parsed(arguments, (prepare, detect, view, serve, export, convert))
         from kmn_jax.geometry import ask_for_fast_selection
-        from kmn_jax.programs import keep_compiled
+        from kmn_jax.programs import call_in_place, keep_compiled
 
         ask_for_fast_selection()
+        call_in_place()
         keep_compiled()
         run()
         sys.stdout.flush()

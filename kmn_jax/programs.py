@@ -55,6 +55,15 @@ def keep_compiled() -> None:
         keep_programs(Path(chosen) / "programs")
 
 
+def call_in_place() -> None:
+    """Let programs on CPUs run in the thread that calls them, not in one of XLA's: call it before JAX is used.
+
+    Searches call many small ones from two threads, which then wait for each other less. Programs for accelerators, or
+    of several devices, run as before.
+    """
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+
 def keep_programs(folder: Path | None) -> None:
     """Keep programs in a folder from now on, where `read_kept` finds those of before; None: keep none."""
     global _store

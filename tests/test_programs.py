@@ -87,6 +87,14 @@ def test_a_version_without_the_compilers_options_compiles_without_them(
     assert files(folder / "other")
 
 
+def test_programs_are_called_in_place_where_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[str, bool]] = []
+    monkeypatch.setattr(programs.jax.config, "update", lambda name, value: asked.append((name, value)))
+    programs.call_in_place()
+    assert asked == [("jax_cpu_enable_async_dispatch", False)]
+    assert "jax_cpu_enable_async_dispatch" in jax.config.values
+
+
 def test_other_arguments_are_another_program(folder: Path) -> None:
     program, traces = counted()
     program(*given(), factor=2.0)

@@ -22,7 +22,7 @@ from kmn_jax.detection import (
     explore,
     seeds_over,
 )
-from kmn_jax.detection._coverage import SEARCHED, SEARCHED_FINELY, unexplained
+from kmn_jax.detection._coverage import SEARCHED, SEARCHED_FINELY, near_surface, unexplained
 from kmn_jax.detection._detect import narrowing
 from kmn_jax.detection._seeds import SPACING
 from kmn_jax.errors import InputError
@@ -126,6 +126,22 @@ def test_what_lies_on_no_pose_is_unexplained(scene: Scene) -> None:
     assert both[on_wall & beside].all()
     np.testing.assert_array_equal(one[~on_wall], scene.points[~on_wall, 0] > 0)
     assert not unexplained(~everything, scene, part, np.stack(POSES)).any()
+
+
+def test_points_are_near_to_a_surface_as_they_are_to_any_of_its_points() -> None:
+    rng = np.random.default_rng(0)
+    surface = rng.uniform((20, -1, 3), (60, 1, 4), (300, 3))  # long, and far from its origin
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    for pose in poses:
+        turned, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        pose[:3, :3], pose[:3, 3] = turned * np.sign(np.linalg.det(turned)), rng.uniform(-30, 30, 3)
+    placed = np.concatenate([surface @ pose[:3, :3].T + pose[:3, 3] for pose in poses])
+    points = np.concatenate([placed[::9] + rng.normal(size=(100, 3)) * 2, rng.uniform(-80, 80, (200, 3))])
+    away = np.linalg.norm(points[:, None] - placed[None], axis=2).min(axis=1)
+    found = near_surface(points, surface, poses, 2.0)
+    np.testing.assert_array_equal(found, away < 2.0)
+    assert 40 < found.sum() < 200
+    assert not near_surface(points, surface, poses[:0], 2.0).any()
 
 
 def test_poses_that_pile_up_on_a_plane_bring_a_warning() -> None:

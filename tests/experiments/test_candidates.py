@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from threading import Barrier, Event
 from types import SimpleNamespace
 from typing import Any
 
@@ -295,8 +297,46 @@ def test_what_was_searched_before_an_end_is_not_searched_again(
     (folder / "b-found.npz").write_bytes(b"no numbers")
     with pytest.raises(InputError, match=r"b-found.npz holds no poses .*: remove it"):
         module.collect(Sources(), FitOptions(), network, folder)
-    with pytest.raises(InputError, match="holds searches by other weights or settings: remove it"):
+    with pytest.raises(InputError, match="holds searches by other weights or settings, or other evidence: remove it"):
         module.collect(Sources(method="FPFH"), FitOptions(), network, folder)
+
+
+def test_searches_run_two_at_once_and_keep_their_order() -> None:
+    both, drawn, release = Barrier(2, timeout=20), [], Event()
+    items: list[Any] = list(range(6))
+
+    def given() -> Iterator[Any]:
+        for item in items:
+            drawn.append(item)
+            yield item
+
+    def of_item(item: int) -> Any:
+        if item < 2:
+            both.wait()
+        if item == 0:
+            release.wait(20)  # ends after the second
+            assert max(drawn) <= 3
+        elif item == 1:
+            release.set()
+        return {"error": np.array([item])}
+
+    found = module._side_by_side(of_item, given())  # type: ignore[arg-type]
+    assert [int(part["error"][0]) for part in found] == items
+
+
+def test_an_error_ends_what_was_to_be_searched_next() -> None:
+    begun: list[int] = []
+
+    def of_item(item: int) -> Any:
+        begun.append(item)
+        if item == 1:
+            raise InputError("no such image")
+        return {}
+
+    items: Any = range(100)
+    with pytest.raises(InputError, match="no such image"):
+        module._side_by_side(of_item, items)  # type: ignore[arg-type]
+    assert len(begun) < 8
 
 
 def test_a_search_that_finds_nothing_is_kept_as_well(

@@ -191,9 +191,10 @@ def test_strangers_are_the_parts_of_other_kinds_that_are_nearest_in_size() -> No
         ("round", parts["c"]),
         ("round", parts["a"]),
         ("flat", parts["c"]),
+        ("long", parts["d"]),
     ]
     found = _like_in_size(SimpleNamespace(diameter=10.0), others)  # type: ignore[arg-type]
-    assert found == (parts["a"], parts["b"])
+    assert found == (parts["a"], parts["b"], parts["d"])
     assert _like_in_size(SimpleNamespace(diameter=10.0), others[:1]) == (parts["d"],)  # type: ignore[arg-type]
     assert _like_in_size(SimpleNamespace(diameter=10.0), []) == ()  # type: ignore[arg-type]
 

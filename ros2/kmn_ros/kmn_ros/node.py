@@ -20,7 +20,7 @@ from vision_msgs.msg import Detection3DArray
 
 from kmn_jax import InputError, Scan
 from kmn_jax.geometry import ask_for_fast_selection
-from kmn_jax.programs import keep_compiled
+from kmn_jax.programs import call_in_place, keep_compiled
 from kmn_ros.results import detection_array, likely, transforms
 from kmn_ros.scans import scan_of_cloud, scan_of_image
 from kmn_ros.search import PartSearch, Settings
@@ -127,6 +127,7 @@ def _message(package: str, name: str) -> Any:
 def main() -> None:
     """Run the node until ROS is shut down."""
     ask_for_fast_selection()
+    call_in_place()
     keep_compiled()
     rclpy.init()
     executor = MultiThreadedExecutor(num_threads=2)  # one for scans, one for services
