@@ -261,9 +261,10 @@ def _check(is_same: bool) -> None:
 
 def _with_reported(poses: Columns, searched: dict[int, DevicePart], fits: FitOptions) -> Columns:
     """Return poses with what detection reports of each search, by models that do not know the image's object."""
-    fine = {name: values[poses["refined"]] for name, values in poses.items()}
+    none = np.zeros(len(poses["error"]), dtype=bool)  # it is not known yet, or that of other evidence
+    fine = {name: values[poses["refined"]] for name, values in (poses | {"reported": none}).items()}
     others, exact = (_models(rows, fits) for rows in (fine, by_largest_error(fine)))
-    reported = np.zeros(len(poses["error"]), dtype=bool)
+    reported = none.copy()
     for row, on_device in searched.items():
         rows = np.flatnonzero((poses["search"] == row) & poses["due"])
         if len(rows):

@@ -34,6 +34,7 @@ class FitOptions:
     folds: int = 5
     members: int = 3  # fits, whose mean is the model of refined poses
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
+    reported_weight: float = 8.0  # of poses that detection reports: what is said of them is what users are told
 
 
 def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -71,13 +72,15 @@ def model_of(poses: dict[str, np.ndarray], options: FitOptions) -> Calibration:
 
 
 def _weights(poses: dict[str, np.ndarray], options: FitOptions) -> Float[np.ndarray, " s"]:
-    """Return how much poses count: refined ones of absent parts more than others, and all less if an object has many.
+    """Return how much poses count: refined ones of absent parts, and what is reported, more, and all less of an object
+    that has many.
 
     What objects, or families of parts, have in common is to be learned, not what those few are like that have most.
     """
     absent = ~np.isfinite(poses["error"])
     _, which, counts = np.unique(poses["object"], return_inverse=True, return_counts=True)
     weights = np.where(absent & poses["refined"], options.absent_weight, 1.0) / np.sqrt(counts[which])
+    weights = np.where(poses["reported"], options.reported_weight, 1.0) * weights
     return weights * (len(weights) / max(weights.sum(), 1e-9))
 
 
