@@ -36,7 +36,7 @@ def few_columns(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_probabilities_hold_for_objects_of_other_kinds() -> None:
     kinds = {"spread": 2.0, "oddity": 3.0}
     poses = drawn(0, **kinds)
-    options = FitOptions(absent_weight=1.0, members=2)
+    options = FitOptions(absent_weight=1.0, reported_weight=1.0, members=2)
     model, _, results = fit(poses, options)
     plain, _, _ = fit(poses | {"reported": np.zeros(len(poses["error"]), dtype=bool)}, options)
     assert results["summary"]["poses"] == poses["reported"].sum()
@@ -95,11 +95,15 @@ def test_absent_parts_count_more_among_refined_poses() -> None:
 
 def test_an_object_with_four_times_the_poses_counts_twice() -> None:
     rows = {"object": np.repeat([3, 7], [100, 25]), "error": np.zeros(125), "refined": np.ones(125, dtype=bool)}
+    rows["reported"] = np.zeros(125, dtype=bool)
     weights = fits._weights(rows, FitOptions())
     np.testing.assert_allclose([weights[:100].sum(), weights[100:].sum()], [125 * 2 / 3, 125 / 3])
     rows["error"][0] = np.inf  # the object is not there
     first, second = fits._weights(rows, FitOptions(absent_weight=3))[:2]
     np.testing.assert_allclose(first, 3 * second)
+    rows["reported"][1] = True
+    first, second, third = fits._weights(rows, FitOptions(absent_weight=3, reported_weight=8))[:3]
+    np.testing.assert_allclose([first, second], [3 * third, 8 * third])
 
 
 def test_poses_of_which_it_is_not_known_whether_they_are_right_do_not_count() -> None:
