@@ -287,6 +287,8 @@ def _choosable(poses: Float32[np.ndarray, "s 4 4"], evidence: Float32[np.ndarray
 
 def _joined(columns: list[Columns]) -> Columns:
     columns = [part for part in columns if part]
+    if not columns:
+        raise InputError("nothing of the bins can be searched: make them anew by python -m experiments.build_data")
     return {name: np.concatenate([part[name] for part in columns]) for name in columns[0]}
 
 
