@@ -32,6 +32,7 @@ def main(
     split: str = "test",
     fewest: int = 8,
     repeats: int = 3,
+    cards: Path | None = None,
     json: Path | None = None,
 ) -> None:
     """Time all images.
@@ -41,12 +42,14 @@ def main(
         split: the datasets' part to read.
         fewest: copies in a bin; bins of fewer are left out.
         repeats: timed searches of each, after a first one.
+        cards: a folder for each dataset with cards of its objects, made by `kmn prepare`, where Open3D is missing.
         json: where results go.
     """
     estimator = PoseEstimator.from_pretrained()
     rows = []
     for folder in folders:
-        for image in tqdm(bin_images(folder, split, estimator.model), unit="image", desc=folder.name):
+        images = bin_images(folder, split, estimator.model, cards=cards and cards / folder.name)
+        for image in tqdm(images, unit="image", desc=folder.name):
             if len(image.truth) < fewest:
                 continue
             scene = image.scene

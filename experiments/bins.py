@@ -22,7 +22,7 @@ from kmn_jax.errors import InputError
 from kmn_jax.geometry import measured_points
 from kmn_jax.io import Scan
 from kmn_jax.models import Model
-from kmn_jax.objects import ObjectConfig, Part, make_part
+from kmn_jax.objects import CARD_SUFFIX, ObjectConfig, Part, load_part, make_part, model_digest
 from kmn_jax.pose import adi, mssd, symmetric_pose_error
 from kmn_jax.simulate import Bin
 
@@ -131,12 +131,13 @@ def mssd_of_pairs(pairs: jax.Array, points: jax.Array, symmetries: jax.Array) ->
     return jax.lax.map(lambda pair: mssd(pair[0], pair[1], points, symmetries), pairs)
 
 
-def bin_images(folder: Path, split: str, model: Model, every: int = 1) -> Iterator[BinImage]:
+def bin_images(folder: Path, split: str, model: Model, every: int = 1, cards: Path | None = None) -> Iterator[BinImage]:
     """Yield every so many images of a dataset whose bins hold copies of one part each.
 
-    Raises InputError if the folder is no such dataset.
+    Objects are read from their meshes, or, where Open3D is missing, from `cards` that `kmn prepare` made of them.
+    Raises InputError if the folder is no such dataset, or a card is missing or of other weights.
     """
-    dataset, parts = _opened(folder, split, model)
+    dataset, parts = _opened(folder, split, model, cards)
     for key in dataset.keys[::every]:
         frame = dataset.frame(*key, masks=True).with_visibility()
         instances = frame.instances or ()
@@ -201,10 +202,13 @@ def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldIm
         )
 
 
-def _opened(folder: Path, split: str, model: Model) -> tuple[BopDataset, dict[int, Part]]:
+def _opened(folder: Path, split: str, model: Model, cards: Path | None = None) -> tuple[BopDataset, dict[int, Part]]:
     """Return a dataset and its parts. Raises InputError if one cannot be used."""
     require_made(folder)
     dataset = BopDataset(folder, split, unit=_UNIT)
+    if cards is not None:
+        files = {number: cards / f"obj_{number:06d}{CARD_SUFFIX}" for number in dataset.object_ids or ()}
+        return dataset, {number: load_part(file, model_digest(model)) for number, file in files.items()}
     models, problems = load_models(dataset, ObjectConfig(num_points=4096))
     if problems:
         raise InputError(f"{folder}: {problems[0]}")

@@ -47,13 +47,12 @@ _COLUMNS = (  # of what is stored
     "largest_error",
     "object",
     "search",
-    "narrowed",
     "T_camera_object",
     "refined",
     "due",  # whether they are of what detection chooses among, which refines less; of parts that are not known
     "reported",
 )
-_HOW = 5  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
+_HOW = 6  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
 _IN_MEMORY = 600  # searches, of each of which what was found first, crops and all, takes 10 MB
 _AT_ONCE = 2  # searches: one alone leaves a part of two cores idle
 

@@ -20,11 +20,10 @@ from kmn_jax.detection import (
     expected_calibration_error,
     fit_calibration,
     fit_logistic,
-    vouched,
 )
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, require
 
-_SCALE_RIDGE = 1e-4  # hardly any: it makes probabilities too modest
+_RIDGE = 1e-4  # hardly any: it makes probabilities too modest
 
 
 @dataclass(frozen=True)
@@ -35,6 +34,11 @@ class FitOptions:
     members: int = 3  # fits, whose mean is the model of refined poses
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
     reported_weight: float = 8.0  # of poses that detection reports: what is said of them is what users are told
+    in_vain: float = 0.4  # the share of searches for parts that are not there, as probabilities are told
+
+    def __post_init__(self) -> None:
+        """Refuse values that contradict their meaning."""
+        require(0 < self.in_vain < 1, f"in_vain = {self.in_vain} must be between 0 and 1")
 
 
 def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -104,49 +108,67 @@ def fit(poses: dict[str, np.ndarray], options: FitOptions) -> Fitted:
         own = np.isin(poses["object"], names)
         held_out[own] = others.logit(poses["evidence"][own])
     model = model_of(poses, options)
-    judged = np.ones_like(right)
-    if poses["reported"].any():
-        judged = poses["reported"]
-        scale = fit_logistic(held_out[judged, None], right[judged], ("logit",), _SCALE_RIDGE)
-        if scale.weights[0] <= 0:
-            raise InputError("poses are right no more often where models of other objects say so: give more bins")
-        model, held_out = model.scaled(scale.weights[0], scale.bias), scale.weights[0] * held_out + scale.bias
-    return Fitted(model, held_out, _judged({name: values[judged] for name, values in poses.items()}, held_out[judged]))
+    if not poses["reported"].any():
+        return Fitted(model, held_out, _judged(poses, held_out, np.ones(len(right))))
+    judged = _reported(poses)
+    counts = _as_asked(judged, options)
+    scale = _logistic_of(held_out[poses["reported"], None], judged, ("logit",), counts)
+    model, held_out = model.scaled(scale.weights[0], scale.bias), scale.weights[0] * held_out + scale.bias
+    return Fitted(model, held_out, _judged(judged, held_out[poses["reported"]], counts))
 
 
 def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: FitOptions) -> Fitted:
-    """Fit the model of what reported poses of one narrowed search say about each other, given the log odds of each.
+    """Fit the model of what reported poses of one search say about each other, given the log odds of each.
 
-    What is judged are all reported poses, of which those of other searches, and those that are alone, keep their odds.
-    Raises InputError if no two poses are reported of one such search.
+    What is judged are all reported poses. Raises InputError if none is reported.
     """
-    logits = logits[poses["reported"]]
-    poses = {name: values[poses["reported"]] for name, values in poses.items()}
-    right, together = poses["error"] < THRESHOLD, poses["narrowed"].copy()
-    rows_of = [np.flatnonzero(poses["search"] == search) for search in np.unique(poses["search"])]
+    logits, poses = logits[poses["reported"]], _reported(poses)
+    require(bool(len(logits)), "detection would report no pose in the bins: give more bins")
     columns = np.zeros((len(logits), len(COMPANY)))
-    for rows in rows_of:
-        columns[rows] = company(logits[rows])
-        together[rows] &= len(rows) > 1
-    if not together.any():
-        raise InputError("in no image of the bins are two poses reported: give more bins")
+    for search in np.unique(poses["search"]):
+        own = poses["search"] == search
+        columns[own] = company(logits[own])
+    counts, held_out = _as_asked(poses, options), logits.copy()
 
     def of_company(rows: Bool[np.ndarray, " s"]) -> Calibration:
-        return fit_logistic(columns[rows], right[rows], COMPANY, _SCALE_RIDGE)
+        return _logistic_of(columns[rows], {name: of[rows] for name, of in poses.items()}, COMPANY, counts[rows])
 
-    held_out = logits.copy()
     for names in _folds(poses, options):
-        own = together & np.isin(poses["object"], names)
-        if own.any():
-            others = of_company(together & ~own)
-            for rows in rows_of:
-                if own[rows].any():
-                    held_out[rows] = vouched(logits[rows], others)
-    return Fitted(of_company(together), held_out, _judged(poses, held_out))
+        own = np.isin(poses["object"], names)
+        held_out[own] = of_company(~own).logit(columns[own])
+    return Fitted(of_company(np.ones(len(logits), dtype=bool)), held_out, _judged(poses, held_out, counts))
 
 
-def _judged(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"]) -> dict[str, Any]:
-    """Return how well log odds predict which poses are right."""
+def _reported(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {column: values[poses["reported"]] for column, values in poses.items()}
+
+
+def _as_asked(poses: dict[str, np.ndarray], options: FitOptions) -> Float[np.ndarray, " s"]:
+    """Return how much reported poses count, so that a share of the searches in which there are any is in vain."""
+    absent = ~np.isfinite(poses["error"])
+    in_vain, others = (len(np.unique(poses["search"][of])) for of in (absent, ~absent))
+    if not in_vain or not others:
+        return np.ones(len(absent))
+    return np.where(absent, options.in_vain / (1 - options.in_vain) * others / in_vain, 1.0)
+
+
+def _logistic_of(
+    columns: Float[np.ndarray, "s f"],
+    poses: dict[str, np.ndarray],
+    names: tuple[str, ...],
+    counts: Float[np.ndarray, " s"],
+) -> Calibration:
+    """Return the logistic model of columns, the first of which must speak for poses."""
+    fitted = fit_logistic(columns, poses["error"] < THRESHOLD, names, _RIDGE, counts)
+    if fitted.weights[0] <= 0:
+        raise InputError("poses are right no more often where models of other objects say so: give more bins")
+    return fitted
+
+
+def _judged(
+    poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], counts: Float[np.ndarray, " s"]
+) -> dict[str, Any]:
+    """Return how well log odds predict which poses are right, where some count as several."""
     right, there = poses["error"] < THRESHOLD, np.isfinite(poses["error"])
     probability = 1 / (1 + np.exp(-logits))
     accepted = probability >= DetectConfig().accepted
@@ -155,9 +177,11 @@ def _judged(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"]) -> di
         "objects": len(np.unique(poses["object"])),
         "poses": len(right),
         "right": float(right.mean()),
-        "expected calibration error": expected_calibration_error(probability, right),
+        "expected calibration error": expected_calibration_error(probability, right, weights=counts),
+        "searched in vain": len(np.unique(poses["search"][~there])),
+        "accepted there": int((accepted & ~there).sum()),
         "right among accepted": float(right[accepted].mean()) if accepted.any() else None,
         "right among accepted where the part is": float(right[present].mean()) if present.any() else None,
         "accepted among right": float(accepted[right].mean()),
     }
-    return {"summary": summary, "reliability": reliability_table(probability, right)}
+    return {"summary": summary, "reliability": reliability_table(probability, right, counts)}

@@ -14,7 +14,6 @@ from kmn_jax.detection._calibration import (
     load_probabilities,
     probabilities_bytes,
     reliability,
-    vouched,
 )
 from kmn_jax.detection._canonical import canonical_pose
 from kmn_jax.detection._coverage import near_surface
@@ -206,7 +205,6 @@ __all__ = [
     "surroundings",
     "symmetry_transforms",
     "table",
-    "vouched",
     "warnings_once",
     "with_grasps",
     "write_bop_csv",
