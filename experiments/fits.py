@@ -48,8 +48,7 @@ def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def told(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return those poses of which it is known whether they are right."""
-    known = ~np.isnan(poses["error"])
-    return {column: values[known] for column, values in poses.items()}
+    return _some(poses, ~np.isnan(poses["error"]))
 
 
 def held_out_models(
@@ -57,8 +56,7 @@ def held_out_models(
 ) -> Iterator[tuple[Int[np.ndarray, " o"], Calibration]]:
     """Yield some objects, and the model that is fitted to the poses of all others, until each had its turn."""
     for own in _folds(poses, options):
-        others = ~np.isin(poses["object"], own)
-        yield own, model_of({column: values[others] for column, values in poses.items()}, options)
+        yield own, model_of(_some(poses, ~np.isin(poses["object"], own)), options)
 
 
 def _folds(poses: dict[str, np.ndarray], options: FitOptions) -> list[Int[np.ndarray, " o"]]:
@@ -117,8 +115,17 @@ def fit(poses: dict[str, np.ndarray], options: FitOptions) -> Fitted:
     return Fitted(model, held_out, _judged(judged, held_out[poses["reported"]], counts))
 
 
-def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: FitOptions) -> Fitted:
-    """Fit the model of what reported poses of one search say about each other, given the log odds of each.
+class FittedScenes(NamedTuple):
+    """The models of what `refined` says, see `Probabilities`, and how well both predict objects left out."""
+
+    there: Calibration
+    together: Calibration
+    held_out: Float[np.ndarray, " r"]  # log odds of the reported poses
+    results: dict[str, Any]
+
+
+def fit_scenes(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: FitOptions) -> FittedScenes:
+    """Fit the models of what is said of reported poses, given the log odds of each.
 
     What is judged are all reported poses. Raises InputError if none is reported.
     """
@@ -128,19 +135,32 @@ def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], 
     for search in np.unique(poses["search"]):
         own = poses["search"] == search
         columns[own] = company(logits[own])
-    counts, held_out = _as_asked(poses, options), logits.copy()
+    counts, there = _as_asked(poses, options), np.isfinite(poses["error"])
 
-    def of_company(rows: Bool[np.ndarray, " s"]) -> Calibration:
-        return _logistic_of(columns[rows], {name: of[rows] for name, of in poses.items()}, COMPANY, counts[rows])
+    def models(rows: Bool[np.ndarray, " s"]) -> tuple[Calibration, Calibration]:
+        own, all_of_it = COMPANY[:1], COMPANY
+        return (
+            _logistic_of(columns[there & rows, :1], _some(poses, there & rows), own, counts[there & rows]),
+            _logistic_of(columns[rows], _some(poses, rows), all_of_it, counts[rows]),
+        )
 
+    def told_by(models: tuple[Calibration, Calibration], rows: Bool[np.ndarray, " s"]) -> Float[np.ndarray, " r"]:
+        return np.minimum(models[0].logit(columns[rows, :1]), models[1].logit(columns[rows]))
+
+    held_out = np.zeros(len(logits))
     for names in _folds(poses, options):
         own = np.isin(poses["object"], names)
-        held_out[own] = of_company(~own).logit(columns[own])
-    return Fitted(of_company(np.ones(len(logits), dtype=bool)), held_out, _judged(poses, held_out, counts))
+        held_out[own] = told_by(models(~own), own)
+    fitted = models(np.ones(len(logits), dtype=bool))
+    return FittedScenes(*fitted, held_out, _judged(poses, held_out, counts))
 
 
 def _reported(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    return {column: values[poses["reported"]] for column, values in poses.items()}
+    return _some(poses, poses["reported"])
+
+
+def _some(poses: dict[str, np.ndarray], rows: Bool[np.ndarray, " s"]) -> dict[str, np.ndarray]:
+    return {column: values[rows] for column, values in poses.items()}
 
 
 def _as_asked(poses: dict[str, np.ndarray], options: FitOptions) -> Float[np.ndarray, " s"]:

@@ -167,6 +167,7 @@ def _mean(
 
 
 COMPANY = ("own", "best", "number", "share")  # the evidence of `together`, see `company`
+_OF_LOGITS = {"there": COMPANY[:1], "together": COMPANY}  # models whose evidence is what another model says
 
 
 def company(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 4"]:
@@ -186,18 +187,24 @@ class Probabilities:
     """The model of poses as they are found, which chooses among them, and that of refined ones, which is reported.
 
     `exact` is of refined poses that are right in all of their points, not on average: it tells poses of one place apart
-    that are turned against each other. `together` is of all poses in one scene, by what `refined` says of each: where
-    one is sure, the part is there, and doubtful poses are more often right than where all are doubtful.
+    that are turned against each other.
+
+    The last two are of what `refined` says. `there` is of one pose, if the part is known to be in the scene. `together`
+    is of all poses in a scene of which that is not known: one that is sure tells it, and where all are doubtful they
+    are less often right. What it says of doubtful poses beside sure ones it knows of scenes that hold little but such
+    parts. So no pose is more probable than it were if the part was known to be there.
     """
 
     found: Calibration
     refined: Calibration
     exact: Calibration
+    there: Calibration
     together: Calibration
 
     def of_scene(self, evidence: Float[np.ndarray, "s f"]) -> Float[np.ndarray, " s"]:
         """Return the probabilities of all refined poses that stand in one scene, in the order of `refined`."""
-        return self.together.probability(company(self.refined.logit(evidence)))
+        columns = company(self.refined.logit(evidence))
+        return np.minimum(self.there.probability(columns[:, :1]), self.together.probability(columns))
 
 
 def probabilities_bytes(probabilities: Probabilities) -> bytes:
@@ -215,7 +222,7 @@ def calibration_beside(weights: str | Path) -> Path:
 
 def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
     """Read models of the evidence with the given names. Raises InputError if the file holds anything else."""
-    evidence = {field.name: COMPANY if field.name == "together" else tuple(names) for field in fields(Probabilities)}
+    evidence = {field.name: _OF_LOGITS.get(field.name, tuple(names)) for field in fields(Probabilities)}
     try:
         stored = parse_json(Path(path).read_text(encoding="utf-8"))
         models = {name: _read(stored[name]) for name in evidence if name == "found" or name in stored}

@@ -190,18 +190,21 @@ def test_what_is_said_of_a_scene_is_told_by_all_of_its_poses() -> None:
 
 
 def test_sure_poses_vouch_for_others_of_their_scene() -> None:
-    own = Calibration(("x",), (1.0,), 0.0)
-    models = Probabilities(own, own, own, Calibration(COMPANY, (0.7, 0.3, 0.4, 2.0), -2.5))
+    own, there = Calibration(("x",), (1.0,), 0.0), Calibration(COMPANY[:1], (1.1,), 1.5)
+    models = Probabilities(own, own, own, there, Calibration(COMPANY, (0.7, 0.6, 0.8, 4.0), -4.5))
     rng = np.random.default_rng(0)
     assert len(models.of_scene(np.zeros((0, 1)))) == 0
     for count in (1, 2, 3, 12):
         evidence = 3 * rng.normal(size=(count, 1))
-        together = models.of_scene(evidence)
-        assert (np.diff(together[np.argsort(evidence[:, 0], kind="stable")]) >= 0).all()  # the order stays
+        probability = models.of_scene(evidence)
+        assert (np.diff(probability[np.argsort(evidence[:, 0], kind="stable")]) >= 0).all()  # the order stays
+        assert (probability <= there.probability(evidence)).all()
     doubtful, with_a_sure_one = np.array([[1.0], [0.5]]), np.array([[1.0], [6.0]])
-    assert models.of_scene(with_a_sure_one)[0] > 1.2 * models.of_scene(doubtful)[0]
-    alone = models.of_scene(doubtful[:1])
-    assert alone[0] > models.of_scene(np.array([[1.0], [-3.0], [-3.0]]))[0]  # doubtful ones speak against it
+    beside_a_sure_one = models.of_scene(with_a_sure_one)[0]
+    np.testing.assert_allclose(beside_a_sure_one, there.probability(with_a_sure_one[:1])[0], rtol=1e-12)
+    assert beside_a_sure_one > 1.2 * models.of_scene(doubtful)[0]
+    alone = models.of_scene(doubtful[:1])[0]
+    assert alone > models.of_scene(np.array([[1.0], [-3.0], [-3.0]]))[0]  # doubtful ones speak against it
 
 
 def test_reliability_counts_every_pose_once() -> None:
@@ -234,7 +237,8 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.calibration.json"
     logistic = Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25)
     together = Calibration(COMPANY, (1.1, 1.2, 0.5, 0.5), -4.8)
-    fitted = Probabilities(logistic, fit_calibration(*drawn(200), NAMES), logistic, together)
+    there = Calibration(COMPANY[:1], (1.1,), 1.5)
+    fitted = Probabilities(logistic, fit_calibration(*drawn(200), NAMES), logistic, there, together)
     path.write_bytes(probabilities_bytes(fitted))
     loaded = load_probabilities(path, NAMES)
     evidence, _ = drawn(200)
@@ -243,11 +247,12 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
     assert probabilities_bytes(loaded) == path.read_bytes()
     with pytest.raises(InputError, match="of other evidence"):
         load_probabilities(path, ("first",))
-    path.write_bytes(probabilities_bytes(replace(fitted, together=logistic)))
-    with pytest.raises(InputError, match="of other evidence"):
-        load_probabilities(path, NAMES)
+    for other in (replace(fitted, together=logistic), replace(fitted, there=together)):
+        path.write_bytes(probabilities_bytes(other))
+        with pytest.raises(InputError, match="of other evidence"):
+            load_probabilities(path, NAMES)
     old = json.loads(probabilities_bytes(fitted))
-    del old["exact"], old["together"]
+    del old["exact"], old["there"], old["together"]
     path.write_text(json.dumps(old))
     with pytest.raises(InputError, match="fit it again"):
         load_probabilities(path, NAMES)
@@ -255,7 +260,7 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
         "",
         "[]",
         "{}",
-        '{"found": 1, "refined": {"names": ["first"], "weights": ["x"], "bias": 0}, "exact": 1, "together": 1}',
+        json.dumps(dict.fromkeys(("found", "exact", "there", "together"), 1) | {"refined": {"weights": ["x"]}}),
         _damaged(fitted, values=[0.0] * 15),  # a leaf is missing
         _damaged(fitted, values=[0.0] * 15 + [1e7]),
         _damaged(fitted, values=[0.0] * 15 + [True]),
@@ -284,9 +289,8 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
 def test_a_file_of_the_time_before_trees_says_what_to_do(tmp_path: Path) -> None:
     path = tmp_path / "a.calibration.json"
     own = Calibration(NAMES, (1.0, 0.0, 0.0), 0.0)
-    stored = json.loads(
-        probabilities_bytes(Probabilities(own, own, own, Calibration(COMPANY, (1.0, 1.0, 1.0, 1.0), 0.0)))
-    )
+    of_logits = Calibration(COMPANY[:1], (1.0,), 0.0), Calibration(COMPANY, (1.0, 1.0, 1.0, 1.0), 0.0)
+    stored = json.loads(probabilities_bytes(Probabilities(own, own, own, *of_logits)))
     for model in stored.values():
         for name in ("columns", "thresholds", "values"):
             del model[name]

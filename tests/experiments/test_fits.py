@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments import fits
-from experiments.fits import FitOptions, fit, fit_together
+from experiments.fits import FitOptions, fit, fit_scenes
 from kmn_jax.detection import company, expected_calibration_error
 from kmn_jax.errors import InputError
 
@@ -69,21 +69,25 @@ def in_scenes(random_seed: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
 
 def test_poses_of_one_scene_tell_whether_the_part_is_there() -> None:
     rows, logits = in_scenes(0)
-    model, held_out, results = fit_together(rows, logits, FitOptions(in_vain=0.5))
+    there, together, held_out, results = fit_scenes(rows, logits, FitOptions(in_vain=0.5))
     own, outcome = logits[rows["reported"]], rows["error"][rows["reported"]] < 0.1
     assert results["summary"]["poses"] == len(own) == len(held_out)
     losses = [np.logaddexp(0, np.where(outcome, -1, 1) * odds).mean() for odds in (own, held_out)]
     assert losses[1] < 0.9 * losses[0]
     first = rows["search"][rows["reported"]] == 0
-    np.testing.assert_allclose(model.logit(company(own[first])), held_out[first], atol=0.6)  # of others' scenes
+    told = np.minimum(there.logit(own[first, None]), together.logit(company(own[first])))
+    np.testing.assert_allclose(told, held_out[first], atol=0.6)  # of others' scenes
+    absent = np.isinf(rows["error"][rows["reported"]])
+    in_scenes_with_it = np.logaddexp(0, np.where(outcome, -1, 1) * there.logit(own[:, None]))[~absent].mean()
+    assert in_scenes_with_it < np.logaddexp(0, np.where(outcome, -1, 1) * own)[~absent].mean()
     with pytest.raises(InputError, match="no pose"):
-        fit_together(rows | {"reported": np.zeros(len(logits), dtype=bool)}, logits, FitOptions())
+        fit_scenes(rows | {"reported": np.zeros(len(logits), dtype=bool)}, logits, FitOptions())
 
 
 def test_a_model_that_turns_the_order_of_poses_round_is_refused() -> None:
     rows, logits = in_scenes(0)
     with pytest.raises(InputError, match="give more bins"):
-        fit_together(rows, -logits, FitOptions())
+        fit_scenes(rows, -logits, FitOptions())
 
 
 def test_so_many_searches_count_as_in_vain_as_are_asked_for() -> None:
@@ -95,7 +99,7 @@ def test_so_many_searches_count_as_in_vain_as_are_asked_for() -> None:
         searches = [np.unique(rows["search"][of]) for of in (absent, ~absent)]
         weight = len(searches[0]) * counts[absent][0], len(searches[1]) * counts[~absent][0]
         assert weight[0] / sum(weight) == pytest.approx(in_vain)
-        _, held_out, results = fit_together(rows, logits, FitOptions(in_vain=in_vain))
+        _, _, held_out, results = fit_scenes(rows, logits, FitOptions(in_vain=in_vain))
         assert results["summary"]["expected calibration error"] < 0.06
         said.append(held_out.mean())
     assert said[0] > said[1] > said[2]
