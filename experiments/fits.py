@@ -23,6 +23,7 @@ from kmn_jax.detection import (
 )
 from kmn_jax.errors import InputError, require
 
+Columns = dict[str, np.ndarray]  # of poses: evidence, error and so on, see `Search.columns`
 _RIDGE = 1e-4  # hardly any: it makes probabilities too modest
 
 
@@ -41,31 +42,29 @@ class FitOptions:
         require(0 < self.in_vain < 1, f"in_vain = {self.in_vain} must be between 0 and 1")
 
 
-def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def by_largest_error(poses: Columns) -> Columns:
     """Return poses that are right if all of their points are."""
     return poses | {"error": poses["largest_error"]}
 
 
-def told(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def told(poses: Columns) -> Columns:
     """Return those poses of which it is known whether they are right."""
     return _some(poses, ~np.isnan(poses["error"]))
 
 
-def held_out_models(
-    poses: dict[str, np.ndarray], options: FitOptions
-) -> Iterator[tuple[Int[np.ndarray, " o"], Calibration]]:
+def held_out_models(poses: Columns, options: FitOptions) -> Iterator[tuple[Int[np.ndarray, " o"], Calibration]]:
     """Yield some objects, and the model that is fitted to the poses of all others, until each had its turn."""
     for own in _folds(poses, options):
         yield own, model_of(_some(poses, ~np.isin(poses["object"], own)), options)
 
 
-def _folds(poses: dict[str, np.ndarray], options: FitOptions) -> list[Int[np.ndarray, " o"]]:
+def _folds(poses: Columns, options: FitOptions) -> list[Int[np.ndarray, " o"]]:
     """Return the objects of poses in groups, each of which has its turn as what is not fitted to."""
     names = np.unique(poses["object"])
     return [names[fold :: options.folds] for fold in range(min(options.folds, len(names)))]
 
 
-def model_of(poses: dict[str, np.ndarray], options: FitOptions) -> Calibration:
+def model_of(poses: Columns, options: FitOptions) -> Calibration:
     """Return the model that is fitted to those poses that are `told`, of one member if any is as it was found."""
     members = options.members if poses["refined"].all() else 1  # one is enough to choose what is refined
     poses = told(poses)
@@ -73,7 +72,7 @@ def model_of(poses: dict[str, np.ndarray], options: FitOptions) -> Calibration:
     return fit_calibration(poses["evidence"], right, EVIDENCE, weights, members=members)
 
 
-def _weights(poses: dict[str, np.ndarray], options: FitOptions) -> Float[np.ndarray, " s"]:
+def _weights(poses: Columns, options: FitOptions) -> Float[np.ndarray, " s"]:
     """Return how much poses count: refined ones of absent parts, and what is reported, more, and all less of an object
     that has many.
 
@@ -94,7 +93,7 @@ class Fitted(NamedTuple):
     results: dict[str, Any]
 
 
-def fit(poses: dict[str, np.ndarray], options: FitOptions) -> Fitted:
+def fit(poses: Columns, options: FitOptions) -> Fitted:
     """Fit a model of evidence.
 
     Of all poses it must be `told` whether they are right. Where some are those that detection reports, the scale of the
@@ -124,7 +123,7 @@ class FittedScenes(NamedTuple):
     results: dict[str, Any]
 
 
-def fit_scenes(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: FitOptions) -> FittedScenes:
+def fit_scenes(poses: Columns, logits: Float[np.ndarray, " s"], options: FitOptions) -> FittedScenes:
     """Fit the models of what is said of reported poses, given the log odds of each.
 
     What is judged are all reported poses. Raises InputError if none is reported.
@@ -155,15 +154,15 @@ def fit_scenes(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], op
     return FittedScenes(*fitted, held_out, _judged(poses, held_out, counts))
 
 
-def _reported(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _reported(poses: Columns) -> Columns:
     return _some(poses, poses["reported"])
 
 
-def _some(poses: dict[str, np.ndarray], rows: Bool[np.ndarray, " s"]) -> dict[str, np.ndarray]:
+def _some(poses: Columns, rows: Bool[np.ndarray, " s"]) -> Columns:
     return {column: values[rows] for column, values in poses.items()}
 
 
-def _as_asked(poses: dict[str, np.ndarray], options: FitOptions) -> Float[np.ndarray, " s"]:
+def _as_asked(poses: Columns, options: FitOptions) -> Float[np.ndarray, " s"]:
     """Return how much reported poses count, so that a share of the searches in which there are any is in vain."""
     absent = ~np.isfinite(poses["error"])
     in_vain, others = (len(np.unique(poses["search"][of])) for of in (absent, ~absent))
@@ -174,7 +173,7 @@ def _as_asked(poses: dict[str, np.ndarray], options: FitOptions) -> Float[np.nda
 
 def _logistic_of(
     columns: Float[np.ndarray, "s f"],
-    poses: dict[str, np.ndarray],
+    poses: Columns,
     names: tuple[str, ...],
     counts: Float[np.ndarray, " s"],
 ) -> Calibration:
@@ -185,9 +184,7 @@ def _logistic_of(
     return fitted
 
 
-def _judged(
-    poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], counts: Float[np.ndarray, " s"]
-) -> dict[str, Any]:
+def _judged(poses: Columns, logits: Float[np.ndarray, " s"], counts: Float[np.ndarray, " s"]) -> dict[str, Any]:
     """Return how well log odds predict which poses are right, where some count as several."""
     right, there = poses["error"] < THRESHOLD, np.isfinite(poses["error"])
     probability = 1 / (1 + np.exp(-logits))

@@ -15,6 +15,7 @@ from jaxtyping import Float, Float32
 from tqdm import tqdm
 
 from experiments.bins import BinImage, TrueImage, WorldImage, bin_images, world_images
+from experiments.fits import Columns
 from experiments.test_sets import SPLIT
 from kmn_jax.detection import Candidates, DevicePart, Scene, device_part, make_scene
 from kmn_jax.errors import InputError
@@ -74,7 +75,7 @@ class Search:
             return True
         return False
 
-    def columns(self, found: Candidates) -> dict[str, np.ndarray]:
+    def columns(self, found: Candidates) -> Columns:
         """Return evidence, errors and object of poses."""
         poses = found.T_camera_object[found.usable]
         error = self.errors(poses, self.image.errors)

@@ -20,13 +20,14 @@ SEARCHED_FINELY = 0.2  # the same, as long as rounds find new copies
 _CELL = 0.4  # points are stray if few others lie in their cell
 _LEAST_CROWD = 16  # points of a cell: fewer make no crop
 _SURFACE_POINTS = 1024  # on a part
+_NEARLY = 1.001  # times what is near: farther seeds need not be found
 
 
 class Coverage(NamedTuple):
     """The state of a search."""
 
     left: Bool[np.ndarray, " r"]  # of the scene's points: foreground that no likely pose explains
-    away: Float[np.ndarray, " r"]  # from the nearest seed; it is not kept up where a point is not left
+    away: Float[np.ndarray, " r"]  # from the nearest seed that is near; it is not kept up where a point is not left
     places: Float[np.ndarray, "p 3"]  # centres of likely poses
     barren: int  # rounds since a copy was found
 
@@ -49,7 +50,8 @@ def cover(
 
     rows = np.flatnonzero(before.left)
     away = before.away.copy()
-    distance, _ = cKDTree(scene.points[found.seed_rows]).query(scene.points[rows], workers=2)
+    seeds, near = cKDTree(scene.points[found.seed_rows]), SEARCHED * part.diameter * _NEARLY
+    distance, _ = seeds.query(scene.points[rows], distance_upper_bound=near, workers=2)
     away[rows] = np.minimum(away[rows], distance)
 
     centers = (found.T_camera_object @ np.append((part.minimum + part.maximum) / 2, 1))[:, :3]

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 _Result = TypeVar("_Result")
-_STEP = 16  # items
+_FEWEST = 16  # items that accelerators are given at once
 
 
 def map_rows(function: Callable[..., _Result], *items: Any) -> _Result:
@@ -42,12 +42,13 @@ def call_rows(one: Callable[..., _Result], many: Callable[..., _Result], *items:
     """Return on the host what a compiled function makes of each item, stacked.
 
     On CPUs `one` is called item by item, on two threads, as XLA keeps little more than one core busy with what comes
-    one after the other; elsewhere `many` gets all at once. Contexts of JAX that hold for one thread only, such as
-    `jax.default_device`, do not reach the threads.
+    one after the other; elsewhere `many` gets all at once, filled up to a power of two, as each number that is new
+    compiles for half a minute. Contexts of JAX that hold for one thread only, such as `jax.default_device`, do not
+    reach the threads.
     """
     count = len(jax.tree.leaves(items)[0])
     if jax.default_backend() != "cpu":
-        padded = np.minimum(np.arange(count + -count % _STEP), count - 1)  # few numbers are ever compiled
+        padded = np.minimum(np.arange(max(_FEWEST, 1 << (count - 1).bit_length())), count - 1)
         found: Any = jax.device_get(many(*jax.tree.map(lambda leaf: leaf[padded], items)))
         return cast(_Result, jax.tree.map(lambda leaf: leaf[:count], found))
     rows = [jax.tree.map(lambda leaf, row=row: leaf[row], items) for row in range(count)]

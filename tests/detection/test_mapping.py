@@ -63,6 +63,20 @@ def test_calls_give_what_one_call_of_all_gives(count: int) -> None:
         np.testing.assert_allclose(a, b, rtol=1e-6)
 
 
+def test_accelerators_compile_few_numbers_of_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "cuda")
+    shapes = []
+
+    def many(values: np.ndarray) -> jax.Array:
+        shapes.append(len(values))
+        return jnp.asarray(2 * values)
+
+    for count in (1, 16, 17, 40, 64):
+        values = np.arange(float(count))
+        np.testing.assert_array_equal(call_rows(many, many, values), 2 * values)
+    assert shapes == [16, 16, 32, 64, 64]
+
+
 def test_errors_come_out_of_the_threads() -> None:
     def fail(values: np.ndarray) -> jax.Array:
         return jnp.dot(values, "text")
