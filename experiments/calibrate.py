@@ -14,8 +14,8 @@ fitted to: of known worlds, from which no scale is taken, the first round alone.
 for each place: the one that a third model holds for the most probable, which is fitted to whether all points are in
 their places (MSSD), and not their mean (ADI). Models are too sure of themselves about kinds of objects that they were
 not fitted to: so the scales of the refined poses' models are fitted to what detection would report by models that do
-not know the kind. From the same poses two more models learn what follows from what is said of them: of each, if its
-part is known to be there, and of all of one scene, if it is not.
+not know the kind. From the same poses, of scans of which is known where parts are, a fourth model learns what poses of
+one scene say about each other.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from typing import Annotated, Any
 import tyro
 
 from experiments.candidates import poses_to_fit
-from experiments.fits import FitOptions, by_largest_error, fit, fit_scenes
+from experiments.fits import FitOptions, by_largest_error, fit, fit_together
 from experiments.reliability_picture import save_reliability
 from experiments.searches import Sources
 from kmn_jax.detection import Probabilities, calibration_beside, load_lightgbm, probabilities_bytes
@@ -71,13 +71,12 @@ def calibrate(options: Options) -> dict[str, Any]:
         name: fit(rows, options)
         for name, rows in (("found", found), ("refined", refined), ("exact", by_largest_error(refined)))
     }
-    scenes = fit_scenes(refined, fitted["refined"].held_out, options)
-    results = {name: one.results for name, one in fitted.items()} | {"told": scenes.results}
+    fitted["together"] = fit_together(refined, fitted["refined"].held_out, options)
+    results = {name: one.results for name, one in fitted.items()}
     for name, result in results.items():
         print_table(f"Reliability of poses as {name}, of objects that were not fitted to", result["reliability"])
         print_table(f"Poses as {name}", [result["summary"]])
-    models = {name: one.model for name, one in fitted.items()}
-    probabilities = Probabilities(**models, there=scenes.there, together=scenes.together)
+    probabilities = Probabilities(**{name: one.model for name, one in fitted.items()})
     write_whole(output, probabilities_bytes(probabilities))
     write_json(options.json, results)
     save_reliability({f"poses as {name}": found["reliability"] for name, found in results.items()}, options.picture)

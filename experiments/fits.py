@@ -20,11 +20,11 @@ from kmn_jax.detection import (
     expected_calibration_error,
     fit_calibration,
     fit_logistic,
+    vouched,
 )
-from kmn_jax.errors import InputError, require
+from kmn_jax.errors import InputError
 
-Columns = dict[str, np.ndarray]  # of poses: evidence, error and so on, see `Search.columns`
-_RIDGE = 1e-4  # hardly any: it makes probabilities too modest
+_SCALE_RIDGE = 1e-4  # hardly any: it makes probabilities too modest
 
 
 @dataclass(frozen=True)
@@ -35,36 +35,35 @@ class FitOptions:
     members: int = 3  # fits, whose mean is the model of refined poses
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
     reported_weight: float = 8.0  # of poses that detection reports: what is said of them is what users are told
-    in_vain: float = 0.4  # the share of searches for parts that are not there, as probabilities are told
-
-    def __post_init__(self) -> None:
-        """Refuse values that contradict their meaning."""
-        require(0 < self.in_vain < 1, f"in_vain = {self.in_vain} must be between 0 and 1")
 
 
-def by_largest_error(poses: Columns) -> Columns:
+def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return poses that are right if all of their points are."""
     return poses | {"error": poses["largest_error"]}
 
 
-def told(poses: Columns) -> Columns:
+def told(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return those poses of which it is known whether they are right."""
-    return _some(poses, ~np.isnan(poses["error"]))
+    known = ~np.isnan(poses["error"])
+    return {column: values[known] for column, values in poses.items()}
 
 
-def held_out_models(poses: Columns, options: FitOptions) -> Iterator[tuple[Int[np.ndarray, " o"], Calibration]]:
+def held_out_models(
+    poses: dict[str, np.ndarray], options: FitOptions
+) -> Iterator[tuple[Int[np.ndarray, " o"], Calibration]]:
     """Yield some objects, and the model that is fitted to the poses of all others, until each had its turn."""
     for own in _folds(poses, options):
-        yield own, model_of(_some(poses, ~np.isin(poses["object"], own)), options)
+        others = ~np.isin(poses["object"], own)
+        yield own, model_of({column: values[others] for column, values in poses.items()}, options)
 
 
-def _folds(poses: Columns, options: FitOptions) -> list[Int[np.ndarray, " o"]]:
+def _folds(poses: dict[str, np.ndarray], options: FitOptions) -> list[Int[np.ndarray, " o"]]:
     """Return the objects of poses in groups, each of which has its turn as what is not fitted to."""
     names = np.unique(poses["object"])
     return [names[fold :: options.folds] for fold in range(min(options.folds, len(names)))]
 
 
-def model_of(poses: Columns, options: FitOptions) -> Calibration:
+def model_of(poses: dict[str, np.ndarray], options: FitOptions) -> Calibration:
     """Return the model that is fitted to those poses that are `told`, of one member if any is as it was found."""
     members = options.members if poses["refined"].all() else 1  # one is enough to choose what is refined
     poses = told(poses)
@@ -72,7 +71,7 @@ def model_of(poses: Columns, options: FitOptions) -> Calibration:
     return fit_calibration(poses["evidence"], right, EVIDENCE, weights, members=members)
 
 
-def _weights(poses: Columns, options: FitOptions) -> Float[np.ndarray, " s"]:
+def _weights(poses: dict[str, np.ndarray], options: FitOptions) -> Float[np.ndarray, " s"]:
     """Return how much poses count: refined ones of absent parts, and what is reported, more, and all less of an object
     that has many.
 
@@ -93,7 +92,7 @@ class Fitted(NamedTuple):
     results: dict[str, Any]
 
 
-def fit(poses: Columns, options: FitOptions) -> Fitted:
+def fit(poses: dict[str, np.ndarray], options: FitOptions) -> Fitted:
     """Fit a model of evidence.
 
     Of all poses it must be `told` whether they are right. Where some are those that detection reports, the scale of the
@@ -105,87 +104,49 @@ def fit(poses: Columns, options: FitOptions) -> Fitted:
         own = np.isin(poses["object"], names)
         held_out[own] = others.logit(poses["evidence"][own])
     model = model_of(poses, options)
-    if not poses["reported"].any():
-        return Fitted(model, held_out, _judged(poses, held_out, np.ones(len(right))))
-    judged = _reported(poses)
-    counts = _as_asked(judged, options)
-    scale = _logistic_of(held_out[poses["reported"], None], judged, ("logit",), counts)
-    model, held_out = model.scaled(scale.weights[0], scale.bias), scale.weights[0] * held_out + scale.bias
-    return Fitted(model, held_out, _judged(judged, held_out[poses["reported"]], counts))
+    judged = np.ones_like(right)
+    if poses["reported"].any():
+        judged = poses["reported"]
+        scale = fit_logistic(held_out[judged, None], right[judged], ("logit",), _SCALE_RIDGE)
+        if scale.weights[0] <= 0:
+            raise InputError("poses are right no more often where models of other objects say so: give more bins")
+        model, held_out = model.scaled(scale.weights[0], scale.bias), scale.weights[0] * held_out + scale.bias
+    return Fitted(model, held_out, _judged({name: values[judged] for name, values in poses.items()}, held_out[judged]))
 
 
-class FittedScenes(NamedTuple):
-    """The models of what `refined` says, see `Probabilities`, and how well both predict objects left out."""
+def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: FitOptions) -> Fitted:
+    """Fit the model of what reported poses of one narrowed search say about each other, given the log odds of each.
 
-    there: Calibration
-    together: Calibration
-    held_out: Float[np.ndarray, " r"]  # log odds of the reported poses
-    results: dict[str, Any]
-
-
-def fit_scenes(poses: Columns, logits: Float[np.ndarray, " s"], options: FitOptions) -> FittedScenes:
-    """Fit the models of what is said of reported poses, given the log odds of each.
-
-    What is judged are all reported poses. Raises InputError if none is reported.
+    What is judged are all reported poses, of which those of other searches, and those that are alone, keep their odds.
+    Raises InputError if no two poses are reported of one such search.
     """
-    logits, poses = logits[poses["reported"]], _reported(poses)
-    require(bool(len(logits)), "detection would report no pose in the bins: give more bins")
+    logits = logits[poses["reported"]]
+    poses = {name: values[poses["reported"]] for name, values in poses.items()}
+    right, together = poses["error"] < THRESHOLD, poses["narrowed"].copy()
+    rows_of = [np.flatnonzero(poses["search"] == search) for search in np.unique(poses["search"])]
     columns = np.zeros((len(logits), len(COMPANY)))
-    for search in np.unique(poses["search"]):
-        own = poses["search"] == search
-        columns[own] = company(logits[own])
-    counts, there = _as_asked(poses, options), np.isfinite(poses["error"])
+    for rows in rows_of:
+        columns[rows] = company(logits[rows])
+        together[rows] &= len(rows) > 1
+    if not together.any():
+        raise InputError("in no image of the bins are two poses reported: give more bins")
 
-    def models(rows: Bool[np.ndarray, " s"]) -> tuple[Calibration, Calibration]:
-        own, all_of_it = COMPANY[:1], COMPANY
-        return (
-            _logistic_of(columns[there & rows, :1], _some(poses, there & rows), own, counts[there & rows]),
-            _logistic_of(columns[rows], _some(poses, rows), all_of_it, counts[rows]),
-        )
+    def of_company(rows: Bool[np.ndarray, " s"]) -> Calibration:
+        return fit_logistic(columns[rows], right[rows], COMPANY, _SCALE_RIDGE)
 
-    def told_by(models: tuple[Calibration, Calibration], rows: Bool[np.ndarray, " s"]) -> Float[np.ndarray, " r"]:
-        return np.minimum(models[0].logit(columns[rows, :1]), models[1].logit(columns[rows]))
-
-    held_out = np.zeros(len(logits))
+    held_out = logits.copy()
     for names in _folds(poses, options):
-        own = np.isin(poses["object"], names)
-        held_out[own] = told_by(models(~own), own)
-    fitted = models(np.ones(len(logits), dtype=bool))
-    return FittedScenes(*fitted, held_out, _judged(poses, held_out, counts))
+        own = together & np.isin(poses["object"], names)
+        if own.any():
+            others = of_company(together & ~own)
+            for rows in rows_of:
+                if own[rows].any():
+                    held_out[rows] = vouched(logits[rows], others)
+    return Fitted(of_company(together), held_out, _judged(poses, held_out))
 
 
-def _reported(poses: Columns) -> Columns:
-    return _some(poses, poses["reported"])
-
-
-def _some(poses: Columns, rows: Bool[np.ndarray, " s"]) -> Columns:
-    return {column: values[rows] for column, values in poses.items()}
-
-
-def _as_asked(poses: Columns, options: FitOptions) -> Float[np.ndarray, " s"]:
-    """Return how much reported poses count, so that a share of the searches in which there are any is in vain."""
-    absent = ~np.isfinite(poses["error"])
-    in_vain, others = (len(np.unique(poses["search"][of])) for of in (absent, ~absent))
-    if not in_vain or not others:
-        return np.ones(len(absent))
-    return np.where(absent, options.in_vain / (1 - options.in_vain) * others / in_vain, 1.0)
-
-
-def _logistic_of(
-    columns: Float[np.ndarray, "s f"],
-    poses: Columns,
-    names: tuple[str, ...],
-    counts: Float[np.ndarray, " s"],
-) -> Calibration:
-    """Return the logistic model of columns, the first of which must speak for poses."""
-    fitted = fit_logistic(columns, poses["error"] < THRESHOLD, names, _RIDGE, counts)
-    if fitted.weights[0] <= 0:
-        raise InputError("poses are right no more often where models of other objects say so: give more bins")
-    return fitted
-
-
-def _judged(poses: Columns, logits: Float[np.ndarray, " s"], counts: Float[np.ndarray, " s"]) -> dict[str, Any]:
-    """Return how well log odds predict which poses are right, where some count as several."""
+def _judged(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"]) -> dict[str, Any]:
+    """Return how well log odds predict which poses are right."""
     right, there = poses["error"] < THRESHOLD, np.isfinite(poses["error"])
     probability = 1 / (1 + np.exp(-logits))
     accepted = probability >= DetectConfig().accepted
@@ -194,11 +155,9 @@ def _judged(poses: Columns, logits: Float[np.ndarray, " s"], counts: Float[np.nd
         "objects": len(np.unique(poses["object"])),
         "poses": len(right),
         "right": float(right.mean()),
-        "expected calibration error": expected_calibration_error(probability, right, weights=counts),
-        "searched in vain": len(np.unique(poses["search"][~there])),
-        "accepted there": int((accepted & ~there).sum()),
+        "expected calibration error": expected_calibration_error(probability, right),
         "right among accepted": float(right[accepted].mean()) if accepted.any() else None,
         "right among accepted where the part is": float(right[present].mean()) if present.any() else None,
         "accepted among right": float(accepted[right].mean()),
     }
-    return {"summary": summary, "reliability": reliability_table(probability, right, counts)}
+    return {"summary": summary, "reliability": reliability_table(probability, right)}

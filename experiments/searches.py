@@ -15,7 +15,6 @@ from jaxtyping import Float, Float32
 from tqdm import tqdm
 
 from experiments.bins import BinImage, TrueImage, WorldImage, bin_images, world_images
-from experiments.fits import Columns
 from experiments.test_sets import SPLIT
 from kmn_jax.detection import Candidates, DevicePart, Scene, device_part, make_scene
 from kmn_jax.errors import InputError
@@ -75,7 +74,7 @@ class Search:
             return True
         return False
 
-    def columns(self, found: Candidates) -> Columns:
+    def columns(self, found: Candidates) -> dict[str, np.ndarray]:
         """Return evidence, errors and object of poses."""
         poses = found.T_camera_object[found.usable]
         error = self.errors(poses, self.image.errors)
@@ -86,6 +85,7 @@ class Search:
             "largest_error": self.errors(poses, self.image.largest_errors) if is_own else error,
             "object": np.full(len(poses), self.number),
             "search": np.full(len(poses), self.row),
+            "narrowed": np.full(len(poses), self.scene.is_narrowed),
             "T_camera_object": poses,  # to judge it by other evidence
         }
 

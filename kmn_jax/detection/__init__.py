@@ -14,6 +14,7 @@ from kmn_jax.detection._calibration import (
     load_probabilities,
     probabilities_bytes,
     reliability,
+    vouched,
 )
 from kmn_jax.detection._canonical import canonical_pose
 from kmn_jax.detection._coverage import near_surface
@@ -205,6 +206,7 @@ __all__ = [
     "surroundings",
     "symmetry_transforms",
     "table",
+    "vouched",
     "warnings_once",
     "with_grasps",
     "write_bop_csv",

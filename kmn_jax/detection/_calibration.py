@@ -105,21 +105,11 @@ def _logistic(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
 
 
 def expected_calibration_error(
-    probability: Float[np.ndarray, " s"],
-    right: Bool[np.ndarray, " s"],
-    bins: int = 10,
-    weights: Float[np.ndarray, " s"] | None = None,
+    probability: Float[np.ndarray, " s"], right: Bool[np.ndarray, " s"], bins: int = 10
 ) -> float:
-    """Return the mean difference of probability and share of right poses over equal ranges of probability.
-
-    `weights` count some poses as several.
-    """
-    weights = np.ones(len(right)) if weights is None else weights
-    errors = [
-        weights[own].sum() * abs(_mean(probability, weights, own) - _mean(right, weights, own))
-        for own in _ranges(probability, bins)
-    ]
-    return float(sum(errors) / max(weights.sum(), 1e-9))
+    """Return the mean difference of probability and share of right poses over equal ranges of probability."""
+    rows = reliability(probability, right, bins)
+    return float(sum(count * abs(mean - share) for mean, share, count in rows) / max(len(right), 1))
 
 
 def chance_calibration_error(probability: Float[np.ndarray, " s"], bins: int = 10, draws: int = 200) -> float:
@@ -136,50 +126,20 @@ def chance_calibration_error(probability: Float[np.ndarray, " s"], bins: int = 1
 
 
 def reliability(
-    probability: Float[np.ndarray, " s"],
-    right: Bool[np.ndarray, " s"],
-    bins: int = 10,
-    weights: Float[np.ndarray, " s"] | None = None,
+    probability: Float[np.ndarray, " s"], right: Bool[np.ndarray, " s"], bins: int = 10
 ) -> list[tuple[float, float, int]]:
-    """Return mean probability, share of right poses and their number for each range of probability that has any.
-
-    `weights` count some poses as several in the mean and the share.
-    """
-    weights = np.ones(len(right)) if weights is None else weights
-    return [
-        (_mean(probability, weights, own), _mean(right, weights, own), int(own.sum()))
-        for own in _ranges(probability, bins)
-    ]
-
-
-def _ranges(probability: Float[np.ndarray, " s"], bins: int) -> list[Bool[np.ndarray, " s"]]:
-    """Return which poses are in each range of probability that has any."""
+    """Return mean probability, share of right poses and their number for each range of probability that has any."""
     place = np.minimum((probability * bins).astype(int), bins - 1)
-    return [place == row for row in range(bins) if (place == row).any()]
+    chosen = [place == row for row in range(bins)]
+    return [(float(probability[own].mean()), float(right[own].mean()), int(own.sum())) for own in chosen if own.any()]
 
 
-def _mean(
-    values: Bool[np.ndarray, " s"] | Float[np.ndarray, " s"],
-    weights: Float[np.ndarray, " s"],
-    of: Bool[np.ndarray, " s"],
-) -> float:
-    return float(np.average(values[of], weights=weights[of]))
+COMPANY = ("own", "best")  # the evidence of `together`, see `company`
 
 
-COMPANY = ("own", "best", "number", "share")  # the evidence of `together`, see `company`
-_OF_LOGITS = {"there": COMPANY[:1], "together": COMPANY}  # models whose evidence is what another model says
-
-
-def company(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 4"]:
-    """Return of each pose of one scene its log odds, and what is the same for all of them.
-
-    That are the log odds of the most probable one, the logarithm of 1 and how many are right by what is said of each,
-    and the share of these.
-    """
-    probability = _logistic(logits)
-    number = probability.sum()
-    shared = logits.max(initial=-np.inf), np.log1p(number), number / max(len(logits), 1)
-    return np.stack([logits, *(np.full_like(logits, value) for value in shared)], axis=1)
+def company(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2"]:
+    """Return of each pose of one scene its log odds, and those of the most probable pose there."""
+    return np.stack([logits, np.full_like(logits, logits.max(initial=-np.inf))], axis=1)
 
 
 @dataclass(frozen=True)
@@ -187,24 +147,29 @@ class Probabilities:
     """The model of poses as they are found, which chooses among them, and that of refined ones, which is reported.
 
     `exact` is of refined poses that are right in all of their points, not on average: it tells poses of one place apart
-    that are turned against each other.
-
-    The last two are of what `refined` says. `there` is of one pose, if the part is known to be in the scene. `together`
-    is of all poses in a scene of which that is not known: one that is sure tells it, and where all are doubtful they
-    are less often right. What it says of doubtful poses beside sure ones it knows of scenes that hold little but such
-    parts. So no pose is more probable than it were if the part was known to be there.
+    that are turned against each other. `together` is of poses in one scene of which was said where parts are, by what
+    `refined` says of each: if one is sure, doubtful ones are more often right. Anywhere else poses tell little about
+    each other: there are walls, and other parts, to be mistaken.
     """
 
     found: Calibration
     refined: Calibration
     exact: Calibration
-    there: Calibration
     together: Calibration
 
-    def of_scene(self, evidence: Float[np.ndarray, "s f"]) -> Float[np.ndarray, " s"]:
-        """Return the probabilities of all refined poses that stand in one scene, in the order of `refined`."""
-        columns = company(self.refined.logit(evidence))
-        return np.minimum(self.there.probability(columns[:, :1]), self.together.probability(columns))
+    def of_scene(self, evidence: Float[np.ndarray, "s f"], is_narrowed: bool) -> Float[np.ndarray, " s"]:
+        """Return the probabilities of all refined poses that stand in one scene."""
+        logits = self.refined.logit(evidence)
+        return _logistic(vouched(logits, self.together) if is_narrowed else logits)
+
+
+def vouched(logits: Float[np.ndarray, " s"], together: Calibration) -> Float[np.ndarray, " s"]:
+    """Return the log odds of poses that vouch for each other: none has less than alone, and their order stays.
+
+    That doubtful poses speak against each other is left out: so they do in full bins, which are what is fitted to, but
+    not where the last copy lies.
+    """
+    return np.maximum(logits, together.logit(company(logits))) if len(logits) > 1 else logits
 
 
 def probabilities_bytes(probabilities: Probabilities) -> bytes:
@@ -222,7 +187,7 @@ def calibration_beside(weights: str | Path) -> Path:
 
 def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
     """Read models of the evidence with the given names. Raises InputError if the file holds anything else."""
-    evidence = {field.name: _OF_LOGITS.get(field.name, tuple(names)) for field in fields(Probabilities)}
+    evidence = {field.name: COMPANY if field.name == "together" else tuple(names) for field in fields(Probabilities)}
     try:
         stored = parse_json(Path(path).read_text(encoding="utf-8"))
         models = {name: _read(stored[name]) for name in evidence if name == "found" or name in stored}

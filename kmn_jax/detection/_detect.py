@@ -145,7 +145,7 @@ def detect(
             rows = np.flatnonzero(choice.kept | choice.contenders)
             found = refined_candidates(on_device, scene, found, rows, random_seed, search)
         with clock("selection"):
-            choice, probability = reported(found, probabilities, on_device, config)
+            choice, probability = reported(found, probabilities, on_device, config, scene.is_narrowed)
     else:
         probability = probabilities.found.probability(found.evidence)
     with clock("report"):
@@ -293,12 +293,12 @@ def chosen(
 
 
 def reported(
-    refined: Candidates, probabilities: Probabilities, part: DevicePart, config: DetectConfig
+    refined: Candidates, probabilities: Probabilities, part: DevicePart, config: DetectConfig, is_narrowed: bool
 ) -> tuple[Selection, Float[np.ndarray, " s"]]:
     """Choose among refined candidates, and return also how probable those that stand are, given each other."""
     choice = chosen(refined, probabilities.refined, part, config, probabilities.exact)
     probability = np.zeros(len(choice.kept))
-    probability[choice.kept] = probabilities.of_scene(refined.evidence[choice.kept])
+    probability[choice.kept] = probabilities.of_scene(refined.evidence[choice.kept], is_narrowed)
     return choice, probability
 
 

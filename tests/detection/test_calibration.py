@@ -20,7 +20,6 @@ from kmn_jax.detection import (
     CalibrationArrays,
     Probabilities,
     chance_calibration_error,
-    company,
     device_calibration,
     expected_calibration_error,
     fit_calibration,
@@ -181,30 +180,22 @@ def test_several_members_are_the_mean_of_their_models() -> None:
     assert np.abs(three.logit(evidence) - one.logit(evidence)).max() > 0.01
 
 
-def test_what_is_said_of_a_scene_is_told_by_all_of_its_poses() -> None:
-    logits = np.array([0.0, 4.0, -2.0])
-    probability = 1 / (1 + np.exp(-logits))
-    shared = [4.0, np.log1p(probability.sum()), probability.mean()]
-    np.testing.assert_allclose(company(logits), [[own, *shared] for own in logits], rtol=1e-12)
-    assert company(np.zeros(0)).shape == (0, len(COMPANY))
-
-
 def test_sure_poses_vouch_for_others_of_their_scene() -> None:
-    own, there = Calibration(("x",), (1.0,), 0.0), Calibration(COMPANY[:1], (1.1,), 1.5)
-    models = Probabilities(own, own, own, there, Calibration(COMPANY, (0.7, 0.6, 0.8, 4.0), -4.5))
+    own = Calibration(("x",), (1.0,), 0.0)
+    models = Probabilities(own, own, own, Calibration(COMPANY, (1.1, 1.15), -4.8))
     rng = np.random.default_rng(0)
-    assert len(models.of_scene(np.zeros((0, 1)))) == 0
+    assert len(models.of_scene(np.zeros((0, 1)), True)) == 0
     for count in (1, 2, 3, 12):
         evidence = 3 * rng.normal(size=(count, 1))
-        probability = models.of_scene(evidence)
-        assert (np.diff(probability[np.argsort(evidence[:, 0], kind="stable")]) >= 0).all()  # the order stays
-        assert (probability <= there.probability(evidence)).all()
-    doubtful, with_a_sure_one = np.array([[1.0], [0.5]]), np.array([[1.0], [6.0]])
-    beside_a_sure_one = models.of_scene(with_a_sure_one)[0]
-    np.testing.assert_allclose(beside_a_sure_one, there.probability(with_a_sure_one[:1])[0], rtol=1e-12)
-    assert beside_a_sure_one > 1.2 * models.of_scene(doubtful)[0]
-    alone = models.of_scene(doubtful[:1])[0]
-    assert alone > models.of_scene(np.array([[1.0], [-3.0], [-3.0]]))[0]  # doubtful ones speak against it
+        alone = own.probability(evidence)
+        np.testing.assert_allclose(models.of_scene(evidence, False), alone, rtol=1e-12)
+        together = models.of_scene(evidence, True)
+        assert (together >= alone).all()
+        assert (np.diff(together[np.argsort(alone, kind="stable")]) >= 0).all()  # the order stays
+    np.testing.assert_allclose(models.of_scene(np.array([[1.2]]), True), own.probability(np.array([[1.2]])), rtol=1e-12)
+    doubtful, with_a_sure_one = np.array([[-1.0], [-2.0]]), np.array([[-1.0], [6.0]])
+    np.testing.assert_allclose(models.of_scene(doubtful, True), own.probability(doubtful), rtol=1e-12)
+    assert models.of_scene(with_a_sure_one, True)[0] > 2 * own.probability(doubtful)[0]
 
 
 def test_reliability_counts_every_pose_once() -> None:
@@ -214,31 +205,11 @@ def test_reliability_counts_every_pose_once() -> None:
     np.testing.assert_allclose([mean for mean, _, _ in rows], [0.025, 0.55, 1.0])
 
 
-def test_poses_that_count_as_several_are_as_several() -> None:
-    rng = np.random.default_rng(0)
-    probability, counts = rng.random(200), rng.integers(1, 5, 200)
-    right = rng.random(200) < probability**2
-    several = np.repeat(probability, counts), np.repeat(right, counts)
-    weights = counts.astype(float)
-    assert expected_calibration_error(probability, right, weights=weights) == pytest.approx(
-        expected_calibration_error(*several)
-    )
-    rows, expected = reliability(probability, right, weights=weights), reliability(*several)
-    np.testing.assert_allclose([row[:2] for row in rows], [row[:2] for row in expected])
-    assert sum(count for _, _, count in rows) == 200
-    models = [
-        fit_logistic(np.log(values / (1 - values))[:, None], outcome, ("logit",), 0.0, of)
-        for values, outcome, of in ((probability, right, weights), (*several, None))
-    ]
-    np.testing.assert_allclose(*((model.weights[0], model.bias) for model in models), rtol=1e-3)
-
-
 def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.calibration.json"
     logistic = Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25)
-    together = Calibration(COMPANY, (1.1, 1.2, 0.5, 0.5), -4.8)
-    there = Calibration(COMPANY[:1], (1.1,), 1.5)
-    fitted = Probabilities(logistic, fit_calibration(*drawn(200), NAMES), logistic, there, together)
+    together = Calibration(COMPANY, (1.1, 1.2), -4.8)
+    fitted = Probabilities(logistic, fit_calibration(*drawn(200), NAMES), logistic, together)
     path.write_bytes(probabilities_bytes(fitted))
     loaded = load_probabilities(path, NAMES)
     evidence, _ = drawn(200)
@@ -247,12 +218,11 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
     assert probabilities_bytes(loaded) == path.read_bytes()
     with pytest.raises(InputError, match="of other evidence"):
         load_probabilities(path, ("first",))
-    for other in (replace(fitted, together=logistic), replace(fitted, there=together)):
-        path.write_bytes(probabilities_bytes(other))
-        with pytest.raises(InputError, match="of other evidence"):
-            load_probabilities(path, NAMES)
+    path.write_bytes(probabilities_bytes(replace(fitted, together=logistic)))
+    with pytest.raises(InputError, match="of other evidence"):
+        load_probabilities(path, NAMES)
     old = json.loads(probabilities_bytes(fitted))
-    del old["exact"], old["there"], old["together"]
+    del old["exact"], old["together"]
     path.write_text(json.dumps(old))
     with pytest.raises(InputError, match="fit it again"):
         load_probabilities(path, NAMES)
@@ -260,7 +230,7 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
         "",
         "[]",
         "{}",
-        json.dumps(dict.fromkeys(("found", "exact", "there", "together"), 1) | {"refined": {"weights": ["x"]}}),
+        '{"found": 1, "refined": {"names": ["first"], "weights": ["x"], "bias": 0}, "exact": 1, "together": 1}',
         _damaged(fitted, values=[0.0] * 15),  # a leaf is missing
         _damaged(fitted, values=[0.0] * 15 + [1e7]),
         _damaged(fitted, values=[0.0] * 15 + [True]),
@@ -289,8 +259,7 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
 def test_a_file_of_the_time_before_trees_says_what_to_do(tmp_path: Path) -> None:
     path = tmp_path / "a.calibration.json"
     own = Calibration(NAMES, (1.0, 0.0, 0.0), 0.0)
-    of_logits = Calibration(COMPANY[:1], (1.0,), 0.0), Calibration(COMPANY, (1.0, 1.0, 1.0, 1.0), 0.0)
-    stored = json.loads(probabilities_bytes(Probabilities(own, own, own, *of_logits)))
+    stored = json.loads(probabilities_bytes(Probabilities(own, own, own, Calibration(COMPANY, (1.0, 1.0), 0.0))))
     for model in stored.values():
         for name in ("columns", "thresholds", "values"):
             del model[name]

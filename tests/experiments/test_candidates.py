@@ -86,6 +86,7 @@ def store(path: Path, network: Model, names: tuple[str, ...] = EVIDENCE, **other
         "largest_error": np.array([0.01, 0.2, 0.2, 0.2, 0.01, 0.01]),
         "object": np.array([7, 7, 7, 7, 8, 8]),
         "search": np.array([0, 0, 0, 0, 1, 1]),
+        "narrowed": np.zeros(6, dtype=bool),
         "T_camera_object": poses,
         "refined": np.array([False, True, True, True, True, True]),
         "due": np.array([False, True, True, True, False, False]),
