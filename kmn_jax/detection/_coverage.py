@@ -83,16 +83,17 @@ def near_surface(
     """Return which points are nearer than `near` to one of those of an object's surface, at any of the poses."""
     from scipy.spatial import cKDTree
 
-    left, tree = np.arange(len(points)), cKDTree(surface)
+    tree, apart = cKDTree(surface), np.ones(len(points), dtype=bool)
     middle = (surface.min(axis=0) + surface.max(axis=0)) / 2
     reach = float(np.linalg.norm(surface - middle, axis=1).max()) + near
+    across = np.ascontiguousarray(points[:, 0])
     for pose in T_camera_object:
-        around = np.flatnonzero(((points[left] - placed(pose, middle)) ** 2).sum(axis=1) <= reach**2)
-        distance, _ = tree.query(into(pose, points[left[around]]), distance_upper_bound=near, workers=2)
-        left = np.delete(left, around[np.isfinite(distance)])
-    result = np.ones(len(points), dtype=bool)
-    result[left] = False
-    return result
+        center = placed(pose, middle)
+        rows = np.flatnonzero((np.abs(across - center[0]) <= reach) & apart)  # most are ruled out by that
+        rows = rows[((points[rows] - center) ** 2).sum(axis=1) <= reach**2]
+        distance, _ = tree.query(into(pose, points[rows]), distance_upper_bound=near)
+        apart[rows[np.isfinite(distance)]] = False
+    return ~apart
 
 
 def to_search(state: Coverage, scene: Scene, part: Part, patience: int | None) -> Bool[np.ndarray, " r"]:

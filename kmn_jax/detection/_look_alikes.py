@@ -6,10 +6,12 @@ notch are such poses, and the legs of a bracket in each other's places, which no
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Int
+from jaxtyping import Array, Bool, Float, Float32, Float64, Int
 
 from kmn_jax.geometry import from_rotation_translation, nearest, transform_points
 from kmn_jax.objects import Part
@@ -31,12 +33,27 @@ def look_alikes(
 ) -> tuple[Float32[np.ndarray, "v 4 4"], Bool[np.ndarray, " v"]]:
     """Return poses `T_object_object` that the part is mistaken for, the most similar first, and which are real.
 
-    No two are the same up to symmetry, and none is a symmetry.
+    No two are the same up to symmetry, and none is a symmetry. Of the last parts they are kept for the next scan.
     """
-    points = part.points.astype(np.float64)
+    points, same = part.points.astype(np.float64), symmetries.astype(np.float64)
+    return _of_surface(points.tobytes(), same.tobytes(), part.diameter)
+
+
+@lru_cache(maxsize=64)
+def _of_surface(points: bytes, symmetries: bytes, diameter: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return look-alikes of a part with such points (m, 3) and symmetries (t, 4, 4), in float64."""
+    found = _found(np.frombuffer(points).reshape(-1, 3), np.frombuffer(symmetries).reshape(-1, 4, 4), diameter)
+    for array in found:
+        array.flags.writeable = False  # all who ask for it share it
+    return found
+
+
+def _found(
+    points: Float64[np.ndarray, "m 3"], symmetries: Float64[np.ndarray, "t 4 4"], diameter: float
+) -> tuple[Float32[np.ndarray, "v 4 4"], Bool[np.ndarray, " v"]]:
     center, moments = points.mean(axis=0), np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-    scaled = ((points - center) / part.diameter).astype(np.float32)
-    centred = _scaled(symmetries.astype(np.float64), center, 1 / part.diameter)
+    scaled = ((points - center) / diameter).astype(np.float32)
+    centred = _scaled(symmetries, center, 1 / diameter)
     given = jax.device_put((scaled, _starts(moments), centred))
     poses, distance, apart = map(np.asarray, _laid(given[0], given[1], given[2]))
     chosen = [0]  # the pose itself
@@ -44,7 +61,7 @@ def look_alikes(
         if distance[row] <= _SIMILAR and len(chosen) <= MOST and (apart[row, chosen] > _SAME).all():
             chosen.append(row)
     found = np.tile(np.eye(4), (MOST, 1, 1))
-    found[: len(chosen) - 1] = _scaled(poses[chosen[1:]].astype(np.float64), -center / part.diameter, part.diameter)
+    found[: len(chosen) - 1] = _scaled(poses[chosen[1:]].astype(np.float64), -center / diameter, diameter)
     return found.astype(np.float32), np.arange(MOST) < len(chosen) - 1
 
 

@@ -29,6 +29,7 @@ from kmn_jax.models._layers import (
 
 PairDropout = Literal["shared", "per_pair"]
 
+_BLOCK = 16  # points that a CPU compares with all keypoints at once: more take twice as long
 _WORD = 32  # keypoints whose dropout is in one word
 _RATES = 2**16
 
@@ -68,7 +69,7 @@ class PairHead(nnx.Module):
         if pair_key is not None and pair_dropout == "per_pair" and dropout_rate > 0:
             pooled, keypoint_logits = _per_pair(u, v, weights, dropout_rate, pair_key)
         else:
-            kept = dropout(jnp.ones_like(u), dropout_rate, pair_key)
+            kept = jnp.ones_like(u[:1]) if pair_key is None else dropout(jnp.ones_like(u), dropout_rate, pair_key)
             pooled = kept * leaky_relu(u + v.max(axis=0)[None, :])
             keypoint_logits = pairwise_leaky_sum(u, v, kept * weights[None, :])
         segmentation_logits = product(pooled, self.segmentation[...], compute).astype(jnp.float32)
@@ -96,14 +97,31 @@ def _pair_terms(
 
 
 def pairwise_leaky_sum(
-    u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, "n c"]
+    u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, "w c"]
 ) -> Float[Array, "n k"]:
-    """Return sum over c of weights_nc leaky(u_nc + v_kc), for leak 0.2."""
+    """Return sum over c of weights_nc leaky(u_nc + v_kc), for leak 0.2; one row of weights is that of all points."""
     ones = jnp.ones((u.shape[1], 1))  # XLA's CPU compiler has slow kernels for sums of products, but not for these
     own = jnp.matmul(weights * u, ones, precision=jax.lax.Precision.HIGHEST)
     linear = own + jnp.matmul(weights, v.T, precision=jax.lax.Precision.HIGHEST)
-    absolute = jax.lax.platform_dependent(u, v, weights, cpu=pairwise_absolute_scan, default=pairwise_absolute_fused)
+    on_cpu = pairwise_absolute_blocks if weights.shape[0] == 1 else pairwise_absolute_scan
+    absolute = jax.lax.platform_dependent(u, v, weights, cpu=on_cpu, default=pairwise_absolute_fused)
     return 0.6 * linear + 0.4 * absolute
+
+
+def pairwise_absolute_blocks(
+    u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, "1 c"]
+) -> Float[Array, "n k"]:
+    """Return sum over c of weights_c |u_nc + v_kc|, some points after others: they stay in a CPU's nearest cache."""
+    blocks = jnp.pad(u, ((0, -u.shape[0] % _BLOCK), (0, 0))).reshape(-1, _BLOCK, u.shape[1])
+
+    def one(block: Float[Array, "b c"]) -> Float[Array, "k b"]:
+        @jax.checkpoint  # as below
+        def of_keypoint(v_k: Float[Array, " c"]) -> Float[Array, " b"]:
+            return jnp.matmul(jnp.abs(block + v_k[None, :]), weights[0], precision=jax.lax.Precision.HIGHEST)
+
+        return jax.lax.map(of_keypoint, v)
+
+    return jnp.swapaxes(jax.lax.map(one, blocks), 1, 2).reshape(-1, v.shape[0])[: u.shape[0]]
 
 
 def pairwise_absolute_scan(
@@ -120,12 +138,12 @@ def pairwise_absolute_scan(
 
 
 def pairwise_absolute_fused(
-    u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, "n c"]
+    u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, "w c"]
 ) -> Float[Array, "n k"]:
     """Return the same as one reduction, whose operand XLA's accelerator compilers never store."""
 
     @jax.checkpoint
-    def all_pairs(u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, "n c"]) -> Float[Array, "n k"]:
+    def all_pairs(u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, "w c"]) -> Float[Array, "n k"]:
         return (weights[:, None, :] * jnp.abs(u[:, None, :] + v[None, :, :])).sum(axis=2)
 
     return all_pairs(u, v, weights)

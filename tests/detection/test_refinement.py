@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -77,6 +79,15 @@ def test_look_alikes_lie_on_the_part_and_differ(part: Part) -> None:
         assert surface.query(moved)[0].mean() < 0.1 * part.diameter
         for other in found[:row]:
             assert float(mssd(turn, other, part.points[:300])) > 0.08 * part.diameter
+
+
+def test_look_alikes_of_a_part_are_found_once(part: Part) -> None:
+    (turns, is_real), (again, _) = turns_of(part), turns_of(replace(part, name="of another scan"))
+    assert again is turns
+    with pytest.raises(ValueError, match="read-only"):
+        turns[0] = 0
+    larger, _ = turns_of(replace(part, points=2 * part.points, diameter=2 * part.diameter))
+    np.testing.assert_allclose(larger[is_real][:, :3, 3], 2 * turns[is_real][:, :3, 3], atol=1e-4 * part.diameter)
 
 
 def test_a_box_with_a_notch_is_mistaken_for_its_half_turns(part: Part) -> None:

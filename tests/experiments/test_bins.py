@@ -18,7 +18,7 @@ def test_cards_stand_for_the_meshes_of_a_dataset(tmp_path: Path) -> None:
     model = load_pretrained()
     image = next(bin_images(SMALL, "test", model))
     save_part(image.part, tmp_path / f"{image.part.name}.kmn")
-    with pytest.raises(InputError, match="obj_000002.kmn"):
+    with pytest.raises(InputError, match=r"obj_000002\.kmn"):
         next(bin_images(SMALL, "test", model, cards=tmp_path))
     for stranger in image.strangers:
         save_part(stranger, tmp_path / f"{stranger.name}.kmn")

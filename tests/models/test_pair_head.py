@@ -10,6 +10,7 @@ from benchmarks.reference import dense_jax
 from kmn_jax.models._pair_head import (
     PairHead,
     kept_pairs,
+    pairwise_absolute_blocks,
     pairwise_absolute_fused,
     pairwise_absolute_scan,
     pairwise_leaky_sum,
@@ -73,6 +74,25 @@ def test_pairwise_leaky_sum() -> None:
     z = u[:, None] + v[None]
     want = (w[:, None] * np.where(z > 0, z, 0.2 * z)).sum(axis=2)
     np.testing.assert_allclose(pairwise_leaky_sum(jnp.asarray(u), jnp.asarray(v), jnp.asarray(w)), want, atol=2e-5)
+
+
+@pytest.mark.parametrize("count", [1, 16, 50])
+def test_one_row_of_weights_is_that_of_all_points(count: int) -> None:
+    rng = np.random.default_rng(2)
+    u, v, w = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in [(count, 32), (7, 32), (1, 32)])
+
+    def of(u: jax.Array, v: jax.Array, w: jax.Array) -> jax.Array:
+        return (jnp.cos(jnp.arange(count * 7.0)).reshape(count, 7) * pairwise_leaky_sum(u, v, w)).sum()
+
+    def of_each(u: jax.Array, v: jax.Array, w: jax.Array) -> jax.Array:
+        return of(u, v, jnp.broadcast_to(w, u.shape))
+
+    want = pairwise_leaky_sum(u, v, jnp.broadcast_to(w, u.shape))
+    np.testing.assert_allclose(pairwise_leaky_sum(u, v, w), want, atol=2e-5)
+    np.testing.assert_allclose(pairwise_absolute_blocks(u, v, w), pairwise_absolute_fused(u, v, w), atol=2e-5)
+    gradients = (jax.grad(function, argnums=(0, 1, 2))(u, v, w) for function in (of, of_each))
+    for a, b in zip(*gradients, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", [None, "shared", "per_pair"])
