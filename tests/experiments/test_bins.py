@@ -1,17 +1,58 @@
-"""Bins of datasets, whose objects are read from meshes or from cards that were made of them."""
+"""What is known of images: which parts hardly differ from those that are there; objects as cards, not meshes."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from experiments.bins import bin_images
+from experiments.bins import TrueImage, bin_images
 from kmn_jax.errors import InputError
 from kmn_jax.models import load_pretrained
 from kmn_jax.objects import save_part
 from tests.experiments.test_whole_bin import SMALL
+from tests.reference.clouds import box_cloud
+
+
+def box(size: tuple[float, float, float], random_seed: int, middle: tuple[float, float, float]) -> Any:
+    points = box_cloud(random_seed, 4096, size)[:, :3] + np.asarray(middle)
+    return SimpleNamespace(points=points, diameter=float(np.linalg.norm(size)))
+
+
+def at(*shift: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = shift
+    return pose
+
+
+def test_a_part_looks_like_another_where_most_of_each_surface_lies_on_the_other() -> None:
+    """All is in two copies' frames, whose origins, as those of the strangers, are in no middle of anything."""
+    key: Any = (1, 0)
+    turned, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
+    one, two = at(60.0, -5, 300.0), at(-10, 0, 290.0)
+    one[:3, :3], two[:3, :3] = turned * np.sign(np.linalg.det(turned)), [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    middle = (7.0, -3.0, 11.0)
+    image = TrueImage(key, box((40.0, 24.0, 16.0), 0, middle), (), np.stack([one, two]), np.ones(2))
+
+    def alike(size: tuple[float, float, float], random_seed: int, *shifts: tuple[float, float, float]) -> list[bool]:
+        """Say for a box at either copy, the middle shifted from there."""
+        own = (-4.0, 9.0, 2.0)
+        inwards = [at(*np.asarray(middle) + shift - own) for shift in shifts]
+        poses = np.array([true @ move for move in inwards for true in (one, two)]).reshape(-1, 4, 4)
+        found: list[bool] = image.looks_like(box(size, random_seed, own), poses).tolist()
+        return found
+
+    assert alike((43.0, 24.0, 16.0), 1, (1.5, 0, 0), (5.0, 4.0, 4.0)) == [True, True, False, False]
+    # All of a plate lies on a side of the box, but hardly any of the box on the plate; half a box is none, nor one of
+    # twice the length and more.
+    assert alike((40.0, 24.0, 0.5), 2, (0, 0, -8.0)) == [False, False]
+    assert alike((20.0, 24.0, 16.0), 3, (10.0, 0, 0)) == [False, False]
+    assert alike((100.0, 24.0, 16.0), 4, (30.0, 0, 0)) == [False, False]
+    assert alike((40.0, 24.0, 16.0), 5, (0, 0, 300.0)) == [False, False]
+    assert alike((40.0, 24.0, 16.0), 6) == []
 
 
 def test_cards_stand_for_the_meshes_of_a_dataset(tmp_path: Path) -> None:
