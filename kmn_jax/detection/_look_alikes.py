@@ -51,6 +51,7 @@ def _of_surface(points: bytes, symmetries: bytes, diameter: float) -> tuple[np.n
 def _found(
     points: Float64[np.ndarray, "m 3"], symmetries: Float64[np.ndarray, "t 4 4"], diameter: float
 ) -> tuple[Float32[np.ndarray, "v 4 4"], Bool[np.ndarray, " v"]]:
+    """Find them."""
     center, moments = points.mean(axis=0), np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     scaled = ((points - center) / diameter).astype(np.float32)
     centred = _scaled(symmetries, center, 1 / diameter)

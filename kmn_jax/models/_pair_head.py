@@ -29,7 +29,7 @@ from kmn_jax.models._layers import (
 
 PairDropout = Literal["shared", "per_pair"]
 
-_BLOCK = 16  # points that a CPU compares with all keypoints at once: more take twice as long
+_BLOCK = 16  # points that a CPU compares with all keypoints at once
 _WORD = 32  # keypoints whose dropout is in one word
 _RATES = 2**16
 

@@ -86,6 +86,9 @@ def test_look_alikes_of_a_part_are_found_once(part: Part) -> None:
     assert again is turns
     with pytest.raises(ValueError, match="read-only"):
         turns[0] = 0
+    whole = symmetry_transforms(part.symmetries)
+    others, _ = look_alikes(part, np.concatenate([whole, turns[:1]]))  # as if the most similar one was a symmetry
+    assert float(mssd(turns[0], others[0], part.points[:300])) > 0.08 * part.diameter
     larger, _ = turns_of(replace(part, points=2 * part.points, diameter=2 * part.diameter))
     np.testing.assert_allclose(larger[is_real][:, :3, 3], 2 * turns[is_real][:, :3, 3], atol=1e-4 * part.diameter)
 

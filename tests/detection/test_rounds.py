@@ -22,7 +22,14 @@ from kmn_jax.detection import (
     explore,
     seeds_over,
 )
-from kmn_jax.detection._coverage import SEARCHED, SEARCHED_FINELY, near_surface, unexplained
+from kmn_jax.detection._coverage import (
+    SEARCHED,
+    SEARCHED_FINELY,
+    cover,
+    near_surface,
+    nothing_covered,
+    unexplained,
+)
 from kmn_jax.detection._detect import narrowing
 from kmn_jax.detection._seeds import SPACING
 from kmn_jax.errors import InputError
@@ -115,6 +122,17 @@ def test_seeds_are_no_more_than_asked_for_or_needed(scene: Scene) -> None:
 def test_contradictory_values_are_refused(values: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(values))):
         DetectConfig(**values)  # type: ignore[arg-type]
+
+
+def test_points_know_whether_a_seed_is_near(scene: Scene) -> None:
+    rows = np.array([0, len(scene.points) // 2])
+    state = cover(nothing_covered(scene), scene, PART, answer(scene, rows, False), np.zeros(2, dtype=bool), 0.1)
+    away = np.linalg.norm(scene.points[:, None] - scene.points[rows][None], axis=2).min(axis=1)
+    for share in (SEARCHED, SEARCHED_FINELY):
+        np.testing.assert_array_equal(
+            (state.away > share * DIAMETER)[state.left], (away > share * DIAMETER)[state.left]
+        )
+    assert 0 < (state.away[state.left] > SEARCHED * DIAMETER).mean() < 1
 
 
 def test_what_lies_on_no_pose_is_unexplained(scene: Scene) -> None:

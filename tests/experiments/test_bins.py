@@ -62,9 +62,11 @@ def test_cards_stand_for_the_meshes_of_a_dataset(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"obj_000002\.kmn"):
         next(bin_images(SMALL, "test", model, cards=tmp_path))
     for stranger in image.strangers:
-        save_part(stranger, tmp_path / f"{stranger.name}.kmn")
+        save_part(stranger.in_unit("m"), tmp_path / f"{stranger.name}.kmn")
     other = next(bin_images(SMALL, "test", model, cards=tmp_path))
     assert (image.key, image.part.name) == (other.key, other.part.name)
     np.testing.assert_array_equal(image.part.points, other.part.points)
     np.testing.assert_array_equal(image.truth, other.truth)
-    assert [part.name for part in image.strangers] == [part.name for part in other.strangers] == ["obj_000002"]
+    (stranger,), (of_card,) = image.strangers, other.strangers
+    assert (of_card.name, of_card.unit) == (stranger.name, stranger.unit) == ("obj_000002", "mm")
+    np.testing.assert_allclose(of_card.points, stranger.points, rtol=1e-5)

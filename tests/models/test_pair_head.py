@@ -87,9 +87,13 @@ def test_one_row_of_weights_is_that_of_all_points(count: int) -> None:
     def of_each(u: jax.Array, v: jax.Array, w: jax.Array) -> jax.Array:
         return of(u, v, jnp.broadcast_to(w, u.shape))
 
-    want = pairwise_leaky_sum(u, v, jnp.broadcast_to(w, u.shape))
+    z = np.asarray(u, "f8")[:, None] + np.asarray(v, "f8")[None]
+    want = (np.asarray(w, "f8")[:, None] * np.where(z > 0, z, 0.2 * z)).sum(axis=2)
     np.testing.assert_allclose(pairwise_leaky_sum(u, v, w), want, atol=2e-5)
-    np.testing.assert_allclose(pairwise_absolute_blocks(u, v, w), pairwise_absolute_fused(u, v, w), atol=2e-5)
+    blocks = pairwise_absolute_blocks(u, v, w)
+    np.testing.assert_allclose(blocks, pairwise_absolute_fused(u, v, w), atol=2e-5)
+    several = jax.vmap(pairwise_absolute_blocks, in_axes=(0, None, None))(jnp.stack([u, -u]), v, w)
+    np.testing.assert_allclose(several[0], blocks, atol=2e-5)
     gradients = (jax.grad(function, argnums=(0, 1, 2))(u, v, w) for function in (of, of_each))
     for a, b in zip(*gradients, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4)
