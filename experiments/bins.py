@@ -207,8 +207,9 @@ def _opened(folder: Path, split: str, model: Model, cards: Path | None = None) -
     require_made(folder)
     dataset = BopDataset(folder, split, unit=_UNIT)
     if cards is not None:
-        files, digest = {n: cards / f"obj_{n:06d}{CARD_SUFFIX}" for n in dataset.object_ids or ()}, model_digest(model)
-        return dataset, {number: load_part(file, digest).in_unit(_UNIT) for number, file in files.items()}
+        digest = model_digest(model)
+        files = {object_id: cards / f"obj_{object_id:06d}{CARD_SUFFIX}" for object_id in dataset.object_ids or ()}
+        return dataset, {object_id: load_part(file, digest).in_unit(_UNIT) for object_id, file in files.items()}
     models, problems = load_models(dataset, ObjectConfig(num_points=4096))
     if problems:
         raise InputError(f"{folder}: {problems[0]}")

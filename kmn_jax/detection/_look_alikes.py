@@ -11,7 +11,7 @@ from functools import lru_cache
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Float64, Int
+from jaxtyping import Array, Bool, Float, Float32, Int
 
 from kmn_jax.geometry import from_rotation_translation, nearest, transform_points
 from kmn_jax.objects import Part
@@ -40,18 +40,11 @@ def look_alikes(
 
 
 @lru_cache(maxsize=64)
-def _of_surface(points: bytes, symmetries: bytes, diameter: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return look-alikes of a part with such points (m, 3) and symmetries (t, 4, 4), in float64."""
-    found = _found(np.frombuffer(points).reshape(-1, 3), np.frombuffer(symmetries).reshape(-1, 4, 4), diameter)
-    for array in found:
-        array.flags.writeable = False  # all who ask for it share it
-    return found
-
-
-def _found(
-    points: Float64[np.ndarray, "m 3"], symmetries: Float64[np.ndarray, "t 4 4"], diameter: float
+def _of_surface(
+    surface: bytes, same: bytes, diameter: float
 ) -> tuple[Float32[np.ndarray, "v 4 4"], Bool[np.ndarray, " v"]]:
-    """Find them."""
+    """Return look-alikes of a part with such points (m, 3) and symmetries (t, 4, 4), in float64, to be shared."""
+    points, symmetries = np.frombuffer(surface).reshape(-1, 3), np.frombuffer(same).reshape(-1, 4, 4)
     center, moments = points.mean(axis=0), np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     scaled = ((points - center) / diameter).astype(np.float32)
     centred = _scaled(symmetries, center, 1 / diameter)
@@ -63,7 +56,9 @@ def _found(
             chosen.append(row)
     found = np.tile(np.eye(4), (MOST, 1, 1))
     found[: len(chosen) - 1] = _scaled(poses[chosen[1:]].astype(np.float64), -center / diameter, diameter)
-    return found.astype(np.float32), np.arange(MOST) < len(chosen) - 1
+    turns, is_real = found.astype(np.float32), np.arange(MOST) < len(chosen) - 1
+    turns.flags.writeable = is_real.flags.writeable = False
+    return turns, is_real
 
 
 def _starts(moments: Float[np.ndarray, "3 3"]) -> Float32[np.ndarray, "s 3 3"]:

@@ -42,9 +42,8 @@ def call_rows(one: Callable[..., _Result], many: Callable[..., _Result], *items:
     """Return on the host what a compiled function makes of each item, stacked.
 
     On CPUs `one` is called item by item, on two threads, as XLA keeps little more than one core busy with what comes
-    one after the other; elsewhere `many` gets all at once, filled up to a power of two, as each number that is new
-    is compiled anew. Contexts of JAX that hold for one thread only, such as `jax.default_device`, do not
-    reach the threads.
+    one after the other; elsewhere `many` gets all at once, filled up to a power of two, so that few numbers are ever
+    compiled. Contexts of JAX that hold for one thread only, such as `jax.default_device`, do not reach the threads.
     """
     count = len(jax.tree.leaves(items)[0])
     if jax.default_backend() != "cpu":
