@@ -24,6 +24,7 @@ from kmn_jax.io import Scan
 from kmn_jax.models import Model
 from kmn_jax.objects import CARD_SUFFIX, ObjectConfig, Part, load_part, make_part, model_digest
 from kmn_jax.pose import adi, mssd, symmetric_pose_error
+from kmn_jax.programs import compiled_size
 from kmn_jax.simulate import Bin
 
 _UNIT = "mm"
@@ -90,7 +91,7 @@ class TrueImage:
 
     def _pairs(self, poses: Float[np.ndarray, "s 4 4"]) -> Float32[np.ndarray, "p 2 4 4"]:
         """Return each pose with each true one, padded to a power of two."""
-        capacity = 1 << max(len(poses) * len(self.truth) - 1, 0).bit_length()
+        capacity = compiled_size(len(poses) * len(self.truth))
         pairs = np.stack(np.broadcast_arrays(poses[:, None], self.truth[None]), axis=2).reshape(-1, 2, 4, 4)
         return np.concatenate([pairs, np.tile(np.eye(4), (capacity - len(pairs), 2, 1, 1))]).astype(np.float32)
 
@@ -144,6 +145,8 @@ def bin_images(folder: Path, split: str, model: Model, every: int = 1, cards: Pa
         if not instances or frame.bin is None or frame.T_camera_bin is None:
             raise InputError(f"{folder}: image {key.image_id} of scene {key.scene_id} has no poses or no bin")
         object_id = instances[0].object_id
+        if object_id not in parts:
+            raise InputError(f"{folder} has no model of object {object_id}, of which scene {key.scene_id} is")
         part = parts[object_id]
         inside = _inside(frame, frame.bin, frame.T_camera_bin, part)
         yield BinImage(

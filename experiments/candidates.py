@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float32, Int
 
 from experiments.fits import FitOptions, by_largest_error, held_out_models, model_of, told
 from experiments.fpfh import fpfh_poses
-from experiments.searches import SEARCHED, Search, Sources, searches
+from experiments.searches import SEARCHED, Columns, Search, Sources, searches
 from kmn_jax.detection import (
     EVIDENCE,
     PICTURE_EVIDENCE,
@@ -56,8 +56,6 @@ _COLUMNS = (  # of what is stored
 _HOW = 5  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
 _IN_MEMORY = 600  # searches, of each of which what was found first, crops and all, takes 10 MB
 _AT_ONCE = 2  # searches: one alone leaves a part of two cores idle
-
-Columns = dict[str, np.ndarray]
 
 
 def poses_to_fit(sources: Sources, fits: FitOptions, network: Model, stored: Path | None = None) -> Columns:

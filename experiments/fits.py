@@ -20,6 +20,7 @@ from kmn_jax.detection import (
     expected_calibration_error,
     fit_calibration,
     fit_logistic,
+    keeps_order,
     vouched,
 )
 from kmn_jax.errors import InputError
@@ -118,7 +119,7 @@ def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], 
     """Fit the model of what reported poses of one narrowed search say about each other, given the log odds of each.
 
     What is judged are all reported poses, of which those of other searches, and those that are alone, keep their odds.
-    Raises InputError if no two poses are reported of one such search.
+    Raises InputError if no two poses are reported of one such search, or the less sure ones are right.
     """
     logits = logits[poses["reported"]]
     poses = {name: values[poses["reported"]] for name, values in poses.items()}
@@ -132,7 +133,10 @@ def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], 
         raise InputError("in no image of the bins are two poses reported: give more bins")
 
     def of_company(rows: Bool[np.ndarray, " s"]) -> Calibration:
-        return fit_logistic(columns[rows], right[rows], COMPANY, _SCALE_RIDGE)
+        model = fit_logistic(columns[rows], right[rows], COMPANY, _SCALE_RIDGE)
+        if not keeps_order(model):
+            raise InputError("of poses of one image those are right that are less sure: give more bins")
+        return model
 
     held_out = logits.copy()
     for names in _folds(poses, options):

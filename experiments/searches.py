@@ -22,6 +22,7 @@ from kmn_jax.io import Scan
 from kmn_jax.models import Model
 from kmn_jax.objects import Part
 
+Columns = dict[str, np.ndarray]  # what is known of poses, one row each
 Form = Literal["image", "cloud", "cut-out"]  # what users may have: depth images, clouds, clouds of what is near copies
 _FORMS: tuple[Form, ...] = get_args(Form)
 _MARGINS = (0.1, 0.4)  # diameters: so much of what is around copies is left in scans that are cut out
@@ -74,7 +75,7 @@ class Search:
             return True
         return False
 
-    def columns(self, found: Candidates) -> dict[str, np.ndarray]:
+    def columns(self, found: Candidates) -> Columns:
         """Return evidence, errors and object of poses."""
         poses = found.T_camera_object[found.usable]
         error = self.errors(poses, self.image.errors)

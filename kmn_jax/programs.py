@@ -3,7 +3,7 @@
 JAX's cache keeps what XLA makes of a program. To find it there, a process must trace the program first, which takes
 several times as long as reading what was found. Programs that are marked as `kept` are exported as well, into a folder
 beside that cache; another process reads them in the background, while it reads its input. Where nothing
-asked for a folder, as in a library or in tests, a kept program is what `jax.jit` returns.
+asked for a folder, as in a library or in tests, a kept program is what `jax.jit` returns, compiled as quickly.
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ import os
 import shutil
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import update_wrapper
+from functools import cache, cached_property, update_wrapper
 from pathlib import Path
 from threading import Lock
 from typing import Any, Generic, ParamSpec, TypeVar, cast
 
 import jax
+import jax.numpy as jnp
 import jaxlib
 import numpy as np
 from jax import export
@@ -36,6 +37,7 @@ _PROCESS = 60.0  # seconds: what was used within so many was used by one process
 # Halves the time of compiling; programs are as fast, and round otherwise.
 _QUICK: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
 _store: _Store | None = None
+_begun: set[Any] = set()  # what was done in the background
 
 
 def keep_compiled() -> None:
@@ -78,20 +80,29 @@ def kept_folder() -> Path | None:
     return None if _store is None else _store.folder
 
 
+def compiled_size(count: int) -> int:
+    """Return the power of two that so many rows are filled up to, so that few numbers of them are ever compiled for."""
+    return 1 << max(count - 1, 0).bit_length()
+
+
 def read_kept() -> None:
     """Begin to read what is kept, if anything is; call it once the modules are imported whose programs these are."""
     if _store is not None:
         _store.begin()
 
 
-def meanwhile(work: Callable[[], object]) -> None:
-    """Do in the background, in a process that found nothing kept, what will be asked for later: compiling takes long.
+def meanwhile(work: Callable[..., object], *args: Any) -> None:
+    """Call what will be asked for later in the background, in a process that found nothing kept: compiling takes long.
 
-    Whatever goes wrong goes wrong later on as well, where it is told.
+    That is done once for arguments of the same shapes. Whatever goes wrong goes wrong later on as well, where it is
+    told.
     """
-    if _store is not None and not _store.read:
+    leaves, tree = jax.tree.flatten(args)
+    like = (work, tree, *((leaf.shape, leaf.dtype) if _is_array(leaf) else leaf for leaf in leaves))
+    if like not in _begun and (_store is None or not _store.read):
+        _begun.add(like)
         pool = ThreadPoolExecutor(1, thread_name_prefix="programs")
-        pool.submit(work)
+        pool.submit(work, *args)
         pool.shutdown(wait=False)
 
 
@@ -112,15 +123,22 @@ class KeptProgram(Generic[_Arguments, _Result]):
 
     def __init__(self, function: Callable[_Arguments, _Result], static: tuple[str, ...], results: tuple[type, ...]):
         update_wrapper(self, function)
-        self.compiled = jax.jit(function, static_argnames=static)
+        self.traced = jax.jit(function, static_argnames=static)  # as a part of another program
         self.function, self.static = function, static
         self.signature = inspect.signature(function)
         for result in results:
             with contextlib.suppress(ValueError):  # another program returns it, too
                 export.register_namedtuple_serialization(result, serialized_name=f"kmn_jax.{result.__name__}")
 
+    @cached_property
+    def compiled(self) -> Callable[_Arguments, _Result]:
+        """What is called where nothing is kept."""
+        return jax.jit(self.function, static_argnames=self.static, compiler_options=_options())
+
     def __call__(self, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         """Call it; inside of a trace, and where nothing is kept, as `jax.jit` would."""
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs))):
+            return self.traced(*args, **kwargs)
         if _store is None:
             return self.compiled(*args, **kwargs)
         bound = self.signature.bind(*args, **kwargs)
@@ -135,7 +153,22 @@ class KeptProgram(Generic[_Arguments, _Result]):
 
 
 def _is_array(leaf: Any) -> bool:
-    return isinstance(leaf, jax.Array | np.ndarray | np.generic) and not isinstance(leaf, jax.core.Tracer)
+    return isinstance(leaf, jax.Array | np.ndarray | np.generic)
+
+
+def _options() -> dict[str, str | bool] | None:
+    """Return how the compiler of the devices that are used is asked to be quick; None if it does not know how."""
+    return _QUICK if jax.default_backend() == "cpu" and _are_known(tuple(_QUICK.items())) else None
+
+
+@cache
+def _are_known(options: tuple[tuple[str, str | bool], ...]) -> bool:
+    """Tell whether this version's compiler for CPUs has some options."""
+    try:
+        jax.jit(jnp.negative).lower(0.0).compile(compiler_options=dict(options))
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 class _Store:
@@ -229,11 +262,7 @@ def _read(path: Path) -> Callable[..., Any] | None:
 
 def _compiled(exported: export.Exported) -> Callable[..., Any]:
     like = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in exported.in_avals]
-    program = jax.jit(exported.call).lower(*like)
-    if jax.default_backend() == "cpu":
-        with contextlib.suppress(jax.errors.JaxRuntimeError):  # of versions without these options
-            return program.compile(compiler_options=_QUICK)
-    return program.compile()
+    return jax.jit(exported.call).lower(*like).compile(compiler_options=_options())
 
 
 def _version() -> str:

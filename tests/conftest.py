@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tests.reference.compiled import kept_programs, quick_flags
-from tests.reference.order import place
+from tests.reference.order import is_optimised, place
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the workers have all cores: more threads wait for each other
@@ -60,13 +60,13 @@ def sample_each_surface_once(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def compile_as_the_file_asks(request: pytest.FixtureRequest) -> Iterator[None]:
+def compile_as_the_file_runs(request: pytest.FixtureRequest) -> Iterator[None]:
     """Compile in half of the time what runs for moments only: programs are slower, and round otherwise.
 
     Caches are not asked how a program was compiled, so all is forgotten where that changes; also before programs take
     all the memory maps that Linux allows a process (65,530).
     """
-    few = request.node.get_closest_marker("few_optimisations") is not None
+    few = not is_optimised(request.path)
     if few != jax.config.values[_FEW]:
         _forget()
         jax.config.update(_FEW, few)

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from threading import Event
+from queue import Queue
 from typing import NamedTuple
 
 import jax
@@ -210,11 +210,22 @@ def test_two_threads_make_a_program_once(folder: Path) -> None:
 
 
 def test_work_is_done_ahead_in_a_process_that_found_nothing(folder: Path) -> None:
-    done = Event()
-    programs.meanwhile(done.set)
-    assert done.wait(10)
+    done: Queue[int] = Queue()
+
+    def work(values: np.ndarray, name: str) -> None:
+        done.put(len(values))
+
+    programs.meanwhile(work, np.zeros(3), "a")
+    assert done.get(timeout=10) == 3
+    programs.meanwhile(work, np.ones(3), "a")  # was done
+    programs.meanwhile(work, np.ones(4), "a")
+    assert done.get(timeout=10) == 4
+    programs.meanwhile(work, np.ones(4), "b")
+    assert done.get(timeout=10) == 4
     counted()[0](*given(), factor=2.0)
     next_process(folder)
     programs.meanwhile(lambda: pytest.fail("programs were kept"))
     keep_programs(None)
-    programs.meanwhile(lambda: pytest.fail("nothing is kept"))
+    programs.meanwhile(work, np.zeros(5), "a")
+    assert done.get(timeout=10) == 5
+    assert done.empty()

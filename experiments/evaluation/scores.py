@@ -17,6 +17,7 @@ from experiments.evaluation.predictions import Export, Predictions, Truth
 from kmn_jax.detection import symmetry_transforms
 from kmn_jax.objects import ObjectModel
 from kmn_jax.pose import average_recall, symmetric_pose_error
+from kmn_jax.programs import compiled_size
 
 THRESHOLD = 0.1  # of the object's size
 _POINTS = 1000  # of an object's surface, for errors
@@ -180,7 +181,7 @@ def pair_errors(pairs: Float[np.ndarray, "p 2 4 4"], model: ObjectModel) -> Floa
 
 def _padded(pairs: Float[np.ndarray, "p 2 4 4"]) -> Float32[np.ndarray, "q 2 4 4"]:
     """Return pairs of poses as seen from near to them, padded to a power of two."""
-    capacity = 1 << max(len(pairs) - 1, 0).bit_length()
+    capacity = compiled_size(len(pairs))
     origin = pairs[:, :1, :3, 3].copy()  # float32 of millimetres far from the camera would lose digits
     near = pairs.copy()
     near[:, :, :3, 3] -= origin

@@ -172,6 +172,11 @@ def vouched(logits: Float[np.ndarray, " s"], together: Calibration) -> Float[np.
     return np.maximum(logits, together.logit(company(logits))) if len(logits) > 1 else logits
 
 
+def keeps_order(together: Calibration) -> bool:
+    """Tell whether of two poses of one scene that have company the surer one stays the more probable one."""
+    return len(together.weights) > 0 and together.weights[0] > 0 and not together.values
+
+
 def probabilities_bytes(probabilities: Probabilities) -> bytes:
     """Return the JSON form, in which the values of leaves are rounded."""
     models = asdict(probabilities)
@@ -197,7 +202,10 @@ def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
         raise InputError(f"{path} is not a readable calibration: {shown(error)}") from None
     if {name: model.names for name, model in models.items()} != evidence:
         raise InputError(f"{path} is a calibration of other evidence: fit it again with experiments.calibrate")
-    return Probabilities(**models)
+    result = Probabilities(**models)
+    if not keeps_order(result.together):
+        raise InputError(f"{path} calls poses less probable that are surer: fit it again with experiments.calibrate")
+    return result
 
 
 class _OtherKindError(Exception):

@@ -158,7 +158,7 @@ def draws_in_turn(
         return jnp.zeros((config.most_draws, *leaf.shape), leaf.dtype)
 
     nothing: Any = jax.tree.map(none, jax.eval_shape(one, jnp.int32(0)))
-    scores = jnp.full((config.most_draws, config.num_modes), -jnp.inf)
+    scores = jnp.full((config.most_draws, config.num_modes), -jnp.inf, dtype=jnp.float32)
     return jax.lax.while_loop(more, make, DrawsSearch(jnp.int32(0), nothing[0], nothing[1], scores))
 
 

@@ -15,6 +15,7 @@ from kmn_jax.detection._calibration import Calibration, Probabilities
 from kmn_jax.detection._canonical import canonical_pose
 from kmn_jax.detection._coverage import cover, nothing_covered, to_search, unexplained
 from kmn_jax.detection._crop_search import CropPoses
+from kmn_jax.detection._depth_agreement import DepthImage
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place
 from kmn_jax.detection._draw import CropSearchConfig
 from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
@@ -37,6 +38,7 @@ from kmn_jax.detection._seeds import NUM_SEEDS, seeds_at, seeds_over
 from kmn_jax.detection._selection import Selection, select_poses
 from kmn_jax.detection._timing import Clock
 from kmn_jax.errors import InputError
+from kmn_jax.geometry import PaddedCloud
 from kmn_jax.io import object_doubt
 from kmn_jax.models import KeyMatchNetConfig, Model
 from kmn_jax.objects import Part
@@ -131,7 +133,7 @@ def detect(
     on_device, warnings = device_part(model, part), scene.warnings
     propose = partial(search_at, model, on_device, scene, random_seed=random_seed, config=search)
     if at is None:
-        meanwhile(partial(compile_ahead, on_device, scene, search, model.config.num_keypoints))
+        meanwhile(compile_ahead, on_device, scene.cloud, scene.image, search, model.config.num_keypoints)
         found, more = explore(scene, part, propose, probabilities.found, config, clock)
         warnings = (*warnings, *more)
     else:
@@ -194,14 +196,15 @@ def explore(
     return join(rounds), warnings
 
 
-def compile_ahead(on_device: DevicePart, scene: Scene, config: SearchConfig, num_keypoints: int) -> None:
+def compile_ahead(
+    on_device: DevicePart, cloud: PaddedCloud, image: DepthImage, config: SearchConfig, num_keypoints: int
+) -> None:
     """Judge the poses of a crop that has none, refine some pose and polish it: the only use is that all is compiled."""
     none = no_poses(config.crops, num_keypoints)
-    gather_evidence(none, on_device.arrays, on_device.surfels, scene.image, config.agreement)
+    gather_evidence(none, on_device.arrays, on_device.surfels, image, config.agreement)
     pose, row = jax.device_put((np.eye(4, dtype=np.float32), np.int32(0)))
-    given = (on_device, scene.cloud, scene.image, config.crops.smooth, config.agreement)
-    refine_one(pose, row, jax.random.key(0), *given)
-    polish_one(pose, on_device, scene.image)
+    refine_one(pose, row, jax.random.key(0), on_device, cloud, image, config.crops.smooth, config.agreement)
+    polish_one(pose, on_device, image)
 
 
 def refined_candidates(

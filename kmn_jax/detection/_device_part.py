@@ -12,6 +12,7 @@ from kmn_jax.detection._look_alikes import look_alikes
 from kmn_jax.models import Model
 from kmn_jax.objects import Part, PartArrays, Symmetries, arrays_of
 from kmn_jax.pose import discretise_symmetry
+from kmn_jax.programs import compiled_size
 from kmn_jax.simulate import Surfels
 from kmn_jax.typing import Scalar
 
@@ -35,7 +36,7 @@ class DevicePart(NamedTuple):
 def device_part(model: Model, part: Part) -> DevicePart:
     """Put a part onto the device; its lengths must be in the unit of the scenes."""
     found = symmetry_transforms(part.symmetries)
-    spare = (1 << (len(found) - 1).bit_length()) - len(found)  # a power of two is compiled
+    spare = compiled_size(len(found)) - len(found)
     transforms = np.concatenate([found, np.tile(np.eye(4, dtype=np.float32), (spare, 1, 1))])
     count = _VERIFIED_POINTS
     return DevicePart(

@@ -16,6 +16,7 @@ from kmn_jax.detection._result import Detections
 from kmn_jax.detection._selection import DEPTH, OVERLAP, share_inside
 from kmn_jax.geometry import inverse
 from kmn_jax.objects import Part
+from kmn_jax.programs import compiled_size
 from kmn_jax.typing import Normals, Points, Scalar
 
 _POINTS = 512  # on each surface, that are compared
@@ -76,7 +77,7 @@ def _clashes(found: Sequence[Detections], parts: Sequence[Part]) -> dict[tuple[i
 
 def _overlapping(between: Float[np.ndarray, "p 4 4"], one: Part, other: Part, depth: np.float32) -> np.ndarray:
     """Tell of poses `T_other_one` whether the parts overlap."""
-    capacity = max(16, 1 << (len(between) - 1).bit_length())  # a power of two is compiled
+    capacity = max(16, compiled_size(len(between)))
     padded = np.concatenate([between, np.tile(np.eye(4), (capacity - len(between), 1, 1))]).astype(np.float32)
     both = _overlaps(padded, np.int32(len(between)), _surface(one), _surface(other), depth)
     return np.asarray(both)[: len(between)]

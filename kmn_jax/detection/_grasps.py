@@ -18,6 +18,7 @@ from kmn_jax.detection._scene import Scene
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import PaddedCloud, inverse, pad_cloud, squared_distances, transform_points
 from kmn_jax.objects import Grasps, Part
+from kmn_jax.programs import compiled_size
 from kmn_jax.typing import Points, Pose, Scalar
 
 _OWN = 0.05  # diameters: what was measured so near to the copy's surface is the copy itself
@@ -92,7 +93,7 @@ def with_grasps(
     )
     copies = [_surroundings(copy, part, scene, float(far)) for copy in found.poses]
     most = max([_LEAST_POINTS, *(len(others) for others, _ in copies)])
-    capacity = 1 << (most - 1).bit_length()  # one for all copies, and a power of two is compiled
+    capacity = compiled_size(most)  # one for all copies
     poses = []
     for copy, (others, surface) in zip(found.poses, copies, strict=True):
         T_scene_grasp = copy.T_scene_object @ T_object_grasp

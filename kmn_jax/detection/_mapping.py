@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from kmn_jax.programs import compiled_size
+
 _Result = TypeVar("_Result")
 _FEWEST = 16  # items that accelerators are given at once
 
@@ -47,7 +49,7 @@ def call_rows(one: Callable[..., _Result], many: Callable[..., _Result], *items:
     """
     count = len(jax.tree.leaves(items)[0])
     if jax.default_backend() != "cpu":
-        padded = np.minimum(np.arange(max(_FEWEST, 1 << (count - 1).bit_length())), count - 1)
+        padded = np.minimum(np.arange(max(_FEWEST, compiled_size(count))), count - 1)
         found: Any = jax.device_get(many(*jax.tree.map(lambda leaf: leaf[padded], items)))
         return cast(_Result, jax.tree.map(lambda leaf: leaf[:count], found))
     rows = [jax.tree.map(lambda leaf, row=row: leaf[row], items) for row in range(count)]

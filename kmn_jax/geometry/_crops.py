@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int
 
+from kmn_jax.programs import compiled_size
 from kmn_jax.typing import PRNGKey, Scalar
 
 _TINY = 1e-30  # keeps sums of nothing from dividing by zero
@@ -35,7 +36,7 @@ class Crop(NamedTuple):
 
 def pad_cloud(points: Float32[np.ndarray, "n 3"], least: int = 2) -> PaddedCloud:
     """Return points with zeros after them: few capacities, powers of two of at least `least`, are ever compiled for."""
-    capacity = max(least, 1 << (len(points) - 1).bit_length())
+    capacity = max(least, compiled_size(len(points)))
     padded = np.zeros((capacity, 3), dtype=np.float32)
     padded[: len(points)] = points
     return PaddedCloud(jnp.asarray(padded), jnp.asarray(np.arange(capacity) < len(points)))

@@ -10,8 +10,6 @@ from benchmarks import gate
 from benchmarks.network_cases import make_case
 from kmn_jax.errors import InputError
 
-pytestmark = pytest.mark.few_optimisations
-
 
 def test_a_ratio_that_has_fallen_too_far_is_named() -> None:
     baseline = {"a": 10.0, "b": 10.0, "c": 10.0}

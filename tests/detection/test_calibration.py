@@ -221,6 +221,10 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
     path.write_bytes(probabilities_bytes(replace(fitted, together=logistic)))
     with pytest.raises(InputError, match="of other evidence"):
         load_probabilities(path, NAMES)
+    for turned in (Calibration(COMPANY, (-0.1, 1.2), 0.0), Calibration(COMPANY, (0.0, 1.0), 0.0)):
+        path.write_bytes(probabilities_bytes(replace(fitted, together=turned)))
+        with pytest.raises(InputError, match="that are surer"):
+            load_probabilities(path, NAMES)
     old = json.loads(probabilities_bytes(fitted))
     del old["exact"], old["together"]
     path.write_text(json.dumps(old))

@@ -42,8 +42,6 @@ from kmn_jax.models import Model, load_model, released_file
 from kmn_jax.objects import PartArrays, arrays_of, make_part
 from kmn_jax.pose import IcpConfig, PoseResult, PoseStatus, adi, ransac
 
-pytestmark = pytest.mark.few_optimisations
-
 SMALL = Path(experiments.__file__).parent / "assets" / "small_test_set"
 CONFIG = CropSearchConfig(num_points=512, num_draws=2, num_modes=2, icp=None)
 REFINED = IcpConfig(iterations=8)

@@ -37,8 +37,6 @@ from kmn_jax.simulate import Surfels
 from tests.reference.clouds import box_cloud
 from tests.reference.networks import TINY
 
-pytestmark = pytest.mark.few_optimisations
-
 NETWORK = replace(TINY, num_keypoints=6)
 CROPS = CropSearchConfig(
     num_points=64, num_draws=2, crop_points=256, ransac=RansacConfig(num_hypotheses=50, num_candidates=200)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -70,3 +71,10 @@ def test_cards_stand_for_the_meshes_of_a_dataset(tmp_path: Path) -> None:
     (stranger,), (of_card,) = image.strangers, other.strangers
     assert (of_card.name, of_card.unit) == (stranger.name, stranger.unit) == ("obj_000002", "mm")
     np.testing.assert_allclose(of_card.points, stranger.points, rtol=1e-5)
+
+
+@pytest.mark.parametrize("with_cards", [False, True])
+def test_a_dataset_without_models_says_so(tmp_path: Path, with_cards: bool) -> None:
+    shutil.copytree(SMALL, tmp_path / "set", ignore=shutil.ignore_patterns("models"))
+    with pytest.raises(InputError, match="no model"):
+        next(bin_images(tmp_path / "set", "test", load_pretrained(), cards=tmp_path if with_cards else None))

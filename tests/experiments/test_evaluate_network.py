@@ -20,8 +20,6 @@ from kmn_jax.models import create_model, load_model, load_pretrained, save_model
 from kmn_jax.released import RELEASED
 from tests.reference.networks import TINY
 
-pytestmark = pytest.mark.few_optimisations
-
 ASSETS = Path(__file__).parent.parent.parent / "experiments" / "assets"
 
 

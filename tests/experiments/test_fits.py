@@ -78,6 +78,8 @@ def test_poses_of_scenes_where_the_part_is_vouch_for_each_other() -> None:
     np.testing.assert_allclose(vouched(own[:poses], model), held_out[:poses], atol=0.3)  # of others' scenes
     with pytest.raises(InputError, match="two poses"):
         fit_together(rows | {"narrowed": np.zeros(right.size, dtype=bool)}, logits, FitOptions())
+    with pytest.raises(InputError, match="less sure"):
+        fit_together(rows, -logits, FitOptions())
 
 
 def test_absent_parts_count_more_among_refined_poses() -> None:

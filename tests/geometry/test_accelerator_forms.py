@@ -22,8 +22,6 @@ from kmn_jax.geometry import (
 )
 from tests.reference.devices import accelerator_forms
 
-pytestmark = pytest.mark.few_optimisations  # unrolled loops take long to compile
-
 
 @pytest.fixture
 def points() -> jax.Array:

@@ -10,8 +10,6 @@ import pytest
 from benchmarks.synthetic import box_surface
 from kmn_jax.geometry import group_points, nearest, nearest_within
 
-pytestmark = pytest.mark.few_optimisations
-
 
 def cloud(name: str, key: jax.Array, count: int) -> jax.Array:
     match name:

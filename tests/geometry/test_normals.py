@@ -13,8 +13,6 @@ from kmn_jax.errors import InputError
 from kmn_jax.geometry import _normals as normals
 from kmn_jax.geometry import depth_normals, depth_to_points, estimate_normals, orient_to_camera
 
-pytestmark = pytest.mark.few_optimisations
-
 SEEDS = range(3)
 estimate = jax.jit(estimate_normals, static_argnames="k")
 from_depth = jax.jit(depth_normals, static_argnames="window_radius")

@@ -10,8 +10,6 @@ from kmn_jax.models import KeyMatchNetConfig, Model, create_model, encode_object
 from tests.models.test_keymatchnet import KEYPOINTS, SMALL, assert_close, logits, small_model
 from tests.reference.clouds import box_cloud, scene_crop
 
-pytestmark = pytest.mark.few_optimisations
-
 
 def mirrored(cloud: np.ndarray) -> np.ndarray:
     return cloud * np.float32([-1, 1, 1, -1, 1, 1])

@@ -23,8 +23,6 @@ from kmn_jax.models import (
 )
 from tests.reference.clouds import box_cloud, scene_crop
 
-pytestmark = pytest.mark.few_optimisations
-
 SMALL = {
     "edge_width": 32,
     "embedding_width": 64,

@@ -17,8 +17,6 @@ from kmn_jax.models._pair_head import (
 )
 from tests.models.test_layers import signed_layer
 
-pytestmark = pytest.mark.few_optimisations
-
 
 def signed_head(seed: int) -> PairHead:
     head = PairHead(24, 16, 32, 8, rngs=nnx.Rngs(seed))

@@ -14,8 +14,6 @@ from kmn_jax.pose._icp import _icp
 from kmn_jax.pose._ransac import _ransac
 from tests.reference.devices import accelerator_forms
 
-pytestmark = pytest.mark.few_optimisations  # unrolled loops take long to compile
-
 _DIAMETER = 50.0
 
 

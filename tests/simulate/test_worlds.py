@@ -30,8 +30,6 @@ from kmn_jax.simulate import (
 from kmn_jax.simulate._worlds import _lying
 from tests.reference.meshes import box
 
-pytestmark = pytest.mark.few_optimisations
-
 SIZE = np.array([0.08, 0.05, 0.033])  # metres
 DIAMETER = float(np.linalg.norm(SIZE))
 CONFIG = WorldConfig(background_points=4096, resolution=256, removed=0.0, half_removed=0.0)

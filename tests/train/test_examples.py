@@ -20,8 +20,6 @@ from kmn_jax.train import ExampleConfig
 from kmn_jax.train._examples import Group, RenderedCrops, make_group
 from tests.reference.meshes import pose, random_rotations
 
-pytestmark = pytest.mark.few_optimisations
-
 PACK = Path(__file__).parent.parent.parent / "experiments" / "assets" / "small_pack"
 NETWORK = KeyMatchNetConfig(num_scene_points=64, num_object_points=96, num_keypoints=6)
 CONFIG = ExampleConfig(crops=CropConfig(num_points=64, normals="surface"))
