@@ -133,7 +133,8 @@ def detect(
     on_device, warnings = device_part(model, part), scene.warnings
     propose = partial(search_at, model, on_device, scene, random_seed=random_seed, config=search)
     if at is None:
-        meanwhile(compile_ahead, on_device, scene.cloud, scene.image, search, model.config.num_keypoints)
+        if jax.default_backend() == "cpu":  # elsewhere what is called is compiled for all poses at once
+            meanwhile(compile_ahead, on_device, scene.cloud, scene.image, search, model.config.num_keypoints)
         found, more = explore(scene, part, propose, probabilities.found, config, clock)
         warnings = (*warnings, *more)
     else:
