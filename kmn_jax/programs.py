@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import jaxlib
 import numpy as np
 from jax import export
+from jax.extend.core import get_opaque_trace_state
 
 from kmn_jax.files import write_whole
 
@@ -38,6 +39,7 @@ _PROCESS = 60.0  # seconds: what was used within so many was used by one process
 _QUICK: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
 _store: _Store | None = None
 _begun: set[Any] = set()  # what was done in the background
+_OUTSIDE = get_opaque_trace_state(convention="nnx")  # of all traces, as Flax tells it
 
 
 def keep_compiled() -> None:
@@ -95,7 +97,7 @@ def meanwhile(work: Callable[..., object], *args: Any) -> None:
     """Call what will be asked for later in the background, in a process that found nothing kept: compiling takes long.
 
     That is done once for arguments of the same shapes. Whatever goes wrong goes wrong later on as well, where it is
-    told.
+    told. A process that ends before waits for it.
     """
     leaves, tree = jax.tree.flatten(args)
     like = (work, tree, *((leaf.shape, leaf.dtype) if _is_array(leaf) else leaf for leaf in leaves))
@@ -137,7 +139,7 @@ class KeptProgram(Generic[_Arguments, _Result]):
 
     def __call__(self, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         """Call it; inside of a trace, and where nothing is kept, as `jax.jit` would."""
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs))):
+        if get_opaque_trace_state(convention="nnx") != _OUTSIDE:
             return self.traced(*args, **kwargs)
         if _store is None:
             return self.compiled(*args, **kwargs)

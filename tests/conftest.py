@@ -78,9 +78,10 @@ def compile_as_the_file_runs(request: pytest.FixtureRequest) -> Iterator[None]:
 @pytest.fixture
 def all_optimisations() -> Iterator[None]:
     """Compile with what else is left out in this file: without, each use of a value may be rounded otherwise."""
+    few = jax.config.values[_FEW]
     jax.config.update(_FEW, False)
     yield
-    jax.config.update(_FEW, True)
+    jax.config.update(_FEW, few)
 
 
 def _forget() -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import Queue
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -85,6 +85,45 @@ def test_a_version_without_the_compilers_options_compiles_without_them(
     monkeypatch.setattr(programs, "_QUICK", {"xla_cpu_of_another_version": True})
     jax.tree.map(np.testing.assert_allclose, counted()[0](*given(), factor=2.0), plain)
     assert files(folder / "other")
+
+
+def test_where_nothing_is_kept_it_is_compiled_as_quickly(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    real = jax.jit
+
+    def jit(function: Any, **settings: Any) -> Any:
+        asked.append(settings.get("compiler_options"))
+        return real(function, **settings)
+
+    program, traces = counted()
+    monkeypatch.setattr(programs.jax, "jit", jit)
+    assert float(program(*given(), factor=2.0).total) == 3
+    assert program(*given(), factor=2.0).total == 3
+    assert sum(traces) == 1
+    assert asked[-1] == programs._QUICK
+    monkeypatch.setattr(programs, "_QUICK", {"xla_cpu_of_another_version": True})
+    assert counted()[0](*given(), factor=2.0).total == 3
+    assert asked[-1] is None
+
+
+def test_in_a_trace_arguments_may_be_known() -> None:
+    program, _ = counted()
+    values, key = given()
+    with jax.ensure_compile_time_eval():
+        known = Pair(values.total + 0, values.scaled + 0)
+
+    def doubled(factor: Array) -> Array:
+        return program(known, key, factor=2.0).total * factor
+
+    assert program(known, key, factor=2.0).total == 3
+    for result in (
+        jax.jit(doubled)(2.0),
+        jax.vmap(doubled)(jnp.full(1, 2.0))[0],
+        jax.lax.scan(lambda total, factor: (total + doubled(factor), None), jnp.float32(0), jnp.ones(2))[0],
+        jax.value_and_grad(doubled)(2.0)[0],
+    ):
+        assert result == 6
+    assert jax.eval_shape(doubled, 2.0).shape == ()
 
 
 def test_programs_are_called_in_place_where_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -224,7 +263,7 @@ def test_work_is_done_ahead_in_a_process_that_found_nothing(folder: Path) -> Non
     assert done.get(timeout=10) == 4
     counted()[0](*given(), factor=2.0)
     next_process(folder)
-    programs.meanwhile(lambda: pytest.fail("programs were kept"))
+    programs.meanwhile(work, np.zeros(6), "a")  # programs were kept
     keep_programs(None)
     programs.meanwhile(work, np.zeros(5), "a")
     assert done.get(timeout=10) == 5

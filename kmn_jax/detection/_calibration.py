@@ -204,7 +204,9 @@ def load_probabilities(path: str | Path, names: Sequence[str]) -> Probabilities:
         raise InputError(f"{path} is a calibration of other evidence: fit it again with experiments.calibrate")
     result = Probabilities(**models)
     if not keeps_order(result.together):
-        raise InputError(f"{path} calls poses less probable that are surer: fit it again with experiments.calibrate")
+        raise InputError(
+            f"{path} does not keep the order of poses of one scan: fit it again with experiments.calibrate"
+        )
     return result
 
 

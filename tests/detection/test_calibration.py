@@ -223,7 +223,7 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
         load_probabilities(path, NAMES)
     for turned in (Calibration(COMPANY, (-0.1, 1.2), 0.0), Calibration(COMPANY, (0.0, 1.0), 0.0)):
         path.write_bytes(probabilities_bytes(replace(fitted, together=turned)))
-        with pytest.raises(InputError, match="that are surer"):
+        with pytest.raises(InputError, match="the order of poses"):
             load_probabilities(path, NAMES)
     old = json.loads(probabilities_bytes(fitted))
     del old["exact"], old["together"]

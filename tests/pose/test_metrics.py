@@ -113,6 +113,7 @@ def test_vmap_agrees_with_single_calls():
         np.testing.assert_allclose(jax.vmap(metric)(*batch), [metric(*case) for case in cases], rtol=1e-5)
 
 
+@pytest.mark.usefixtures("all_optimisations")
 def test_pairs_of_points_are_never_stored():
     points = jnp.zeros((2048, 3))
     memory = jax.jit(adi).lower(jnp.eye(4), jnp.eye(4), points).compile().memory_analysis()

@@ -71,6 +71,7 @@ def test_result_is_consistent():
     assert result.rms_error == pytest.approx(np.sqrt((distances**2).mean()), rel=1e-3)
 
 
+@pytest.mark.usefixtures("all_optimisations")
 def test_same_key_same_bits():
     matches, _ = small_matches()
     first, again = ransac(KEY, matches), ransac(KEY, matches)
