@@ -3,8 +3,8 @@
 python -m benchmarks.cold_start [--times 5] [--json FILE]
 
 The first process ever finds an empty cache and compiles everything; those after it read what is kept. The part is a CAD
-file, which is kept as well, or an object card. A search from Python, which keeps nothing, compiles
-each time. Times are of the whole process, Python's start and imports included.
+file, which is kept as well, or an object card. A search from Python, which keeps nothing, compiles each
+time. Times are of the whole process, Python's start and imports included.
 """
 
 from __future__ import annotations
@@ -88,21 +88,25 @@ def _run(cache: Path, part: Path) -> tuple[float, dict[str, float]]:
 def _run_python() -> tuple[float, dict[str, float]]:
     """Return the seconds of a process that searches from Python, and what the result says of them."""
     start = time.perf_counter()
-    done = subprocess.run([sys.executable, "-c", _PYTHON], capture_output=True, text=True)
+    printed = _python("a search from Python", None, "-c", _PYTHON)
     seconds = time.perf_counter() - start
-    if done.returncode:
-        raise InputError(f"a search from Python failed: {done.stderr.strip()}")
-    timing: dict[str, float] = jsons.loads(done.stdout)
+    timing: dict[str, float] = jsons.loads(printed)
     return seconds, timing
 
 
 def _kmn(cache: Path, *arguments: str) -> None:
-    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache)}
-    done = subprocess.run(
-        [sys.executable, "-m", "kmn_jax.cli", *arguments], env=environment, capture_output=True, text=True
-    )
+    _python(f"kmn {arguments[0]}", cache, "-m", "kmn_jax.cli", *arguments)
+
+
+def _python(name: str, cache: Path | None, *arguments: str) -> str:
+    """Return what a process prints that keeps its programs in a cache, or none. Raises InputError if it fails."""
+    environment = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
+    if cache is not None:
+        environment["JAX_COMPILATION_CACHE_DIR"] = str(cache)
+    done = subprocess.run([sys.executable, *arguments], env=environment, capture_output=True, text=True)
     if done.returncode:
-        raise InputError(f"kmn {arguments[0]} failed: {done.stderr.strip()}")
+        raise InputError(f"{name} failed: {done.stderr.strip()}")
+    return done.stdout
 
 
 if __name__ == "__main__":
