@@ -51,7 +51,8 @@ def select(
     apart = jnp.sqrt(((centers[:, None] - centers[None]) ** 2).sum(axis=2))
     spacing = jnp.sqrt(part.surfels.area / points.shape[0])
     radius = safe_norm(points - middle[None]).max()
-    touching = 2 * radius + DEPTH * diameter + spacing  # farther apart, no point of one is in or on the other
+    margin = DEPTH * diameter + spacing
+    touching = 2 * radius + margin  # farther apart, no point of one is in or on the other
 
     def same(row: Int[Array, ""]) -> Bool[Array, " s"]:
         # The mean of the points moves no farther than the farthest of them.
@@ -61,7 +62,9 @@ def select(
     one_each, _ = _greedy(score, usable, same)
 
     def clashing(row: Int[Array, ""]) -> Bool[Array, " s"]:
-        near = (apart[row] <= touching) & one_each
+        to_row = jax.vmap(lambda pose: compose(inverse(poses[row]), pose))(poses)
+        shares = [_shares_in_box(ways, points, margin) for ways in (to_row, jax.vmap(inverse)(to_row))]
+        near = (apart[row] <= touching) & one_each & (jnp.maximum(*shares) > OVERLAP)
 
         def clash(pose: Pose) -> Bool[Array, ""]:
             return overlap(poses[row], pose, points, normals, spacing, DEPTH * diameter) > OVERLAP
@@ -98,10 +101,22 @@ def _greedy(
     return none.at[order].set(taken), jnp.zeros((len(score), len(score)), dtype=bool).at[order].set(others)
 
 
+def _shares_in_box(T_other_own: Float[Array, "s 4 4"], points: Points, margin: Scalar) -> Float[Array, " s"]:
+    """Return which share of the points of one part lies in the other's box: the others are neither in nor on it."""
+    low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
+
+    def share(pose: Pose) -> Scalar:
+        moved = transform_points(pose, points)
+        return ((moved >= low[None]) & (moved <= high[None])).all(axis=1).mean()
+
+    return jax.vmap(share)(T_other_own)
+
+
 def overlap(pose: Pose, other: Pose, points: Points, normals: Normals, spacing: Scalar, depth: Scalar) -> Scalar:
     """Return which share of the points of one part is in or on the other, the larger of the two.
 
-    Points deeper than `depth` below the other's surface are in it; nearer ones with a normal like its own are on it.
+    Points deeper than `depth` below the other's surface are in it, within its hull; nearer ones with a normal like its
+    own are on it.
     `spacing` is how far the points are apart.
     """
 
@@ -116,20 +131,23 @@ def share_inside(
 ) -> Scalar:
     """Return which share of the points of one part is in or on another one; see `overlap`."""
     points, normals = other
-    offsets = (points * normals).sum(axis=1)
+    highest = jax.lax.Precision.HIGHEST
+    along = jnp.matmul(points, normals.T, precision=highest)
+    offsets = jnp.diagonal(along)
     seen = transform_points(T_other_own, own[0])
     away = jnp.sqrt(squared_distances(seen, points))
     nearest = away.min(axis=1, keepdims=True)
-    highest = jax.lax.Precision.HIGHEST
     heights = jnp.matmul(seen, normals.T, precision=highest) - offsets[None]
     # Beyond an edge a point is below one face, but not below all that are about as near.
     height = jnp.where(away <= nearest + spacing, heights, -jnp.inf).max(axis=1)
+    # Where points are sparse, those about as near may all be turned away; outside of the hull nothing is inside.
+    in_hull = (heights <= (along.max(axis=0) - offsets)[None]).all(axis=1)
     row = jnp.argmin(away, axis=1)
     turned = jnp.matmul(own[1], T_other_own[:3, :3].T, precision=highest)
     alike = (turned * normals[row]).sum(axis=1) > _ALIKE  # where parts touch, they are opposite
     flush = jnp.abs(heights[jnp.arange(len(row)), row]) <= depth
     on = flush & (nearest[:, 0] <= depth + spacing) & alike
-    return ((height < -depth) | on).mean()
+    return ((in_hull & (height < -depth)) | on).mean()
 
 
 select_poses = kept("contest", results=(Selection,))(select)

@@ -14,7 +14,7 @@ from kmn_jax.pose._accuracy import (
     match_copies,
     symmetric_pose_error,
 )
-from kmn_jax.pose._icp import IcpConfig, icp, plane_step
+from kmn_jax.pose._icp import IcpConfig, icp, motion_between, plane_step
 from kmn_jax.pose._kabsch import kabsch, rotation_is_determined
 from kmn_jax.pose._matches import MatchConfig, Matches, find_matches
 from kmn_jax.pose._metrics import (
@@ -28,6 +28,7 @@ from kmn_jax.pose._metrics import (
 )
 from kmn_jax.pose._ransac import RansacConfig, ransac, ransac_modes
 from kmn_jax.pose._result import PoseResult, PoseStatus
+from kmn_jax.pose._rounds import repeat_while
 from kmn_jax.pose._surface import SurfaceAgreement, SurfaceConfig, surface_agreement
 
 __all__ = [
@@ -54,11 +55,13 @@ __all__ = [
     "icp",
     "kabsch",
     "match_copies",
+    "motion_between",
     "mssd",
     "plane_step",
     "ransac",
     "ransac_modes",
     "recall",
+    "repeat_while",
     "rotation_is_determined",
     "surface_agreement",
     "symmetric_pose_error",

@@ -25,12 +25,12 @@ from kmn_jax.geometry import (
 )
 from kmn_jax.pose._kabsch import fit_rigid, rotation_is_determined
 from kmn_jax.pose._result import PoseResult, PoseStatus, first_status
+from kmn_jax.pose._rounds import repeat_while
 from kmn_jax.typing import ArrayInput, Mask, Normals, Points, Pose, Scalar
 
 _MIN_PAIRS = 6  # equations that fix a pose when each pair gives one
 _DIVERGED = 0.01  # of the squared gate: a cost that grows by less is noise about the optimum
 _FEW_DISTANCES = 2**20  # up to which all of them take CPUs less time than groups
-_FEW_ROUNDS = 20  # up to which accelerators make all of them: they cost less than to wait for each one's answer
 _ALIKE = 0.3  # cosine of normals: pairs of less are of two surfaces
 _DAMPING = 1e-5  # of the mean diagonal: directions that no pair constrains stay where they are
 
@@ -212,32 +212,15 @@ def _icp(
             pose, determined = fit_rigid(object_side, scene, weights), rotation_is_determined(object_side, weights)
         usable = determined & jnp.isfinite(pose).all() & (inside.sum(dtype=jnp.int32) >= _MIN_PAIRS)
         pose = jnp.where(usable, pose, state.pose)
-        turned = jnp.sqrt(((pose[:3, :3] - state.pose[:3, :3]) ** 2).sum() / 2)  # the angle, for small ones
-        shifted = jnp.sqrt(((pose[:3, 3] - state.pose[:3, 3]) ** 2).sum())
-        return _State(state.step + 1, pose, find_pairs(pose), turned + shifted, determined)
+        return _State(state.step + 1, pose, find_pairs(pose), motion_between(state.pose, pose), determined)
 
     def is_moving(state: _State) -> Bool[Array, ""]:
         return (state.step < config.iterations) & (state.change > config.tolerance)
 
-    def until_still(state: _State) -> _State:
-        return jax.lax.while_loop(is_moving, iterate, state)
-
-    def without_asking(state: _State) -> _State:
-        """Do the same, but for rounds that change nothing: a host that starts kernels need not wait for an answer."""
-
-        def iterate_if_moving(state: _State, _: None) -> tuple[_State, None]:
-            moving = is_moving(state)
-            return jax.tree.map(lambda new, old: jnp.where(moving, new, old), iterate(state), state), None
-
-        return jax.lax.scan(iterate_if_moving, state, length=config.iterations)[0]
-
     start = from_rotation_translation(initial[:3, :3], jnp.zeros(3))
     first = find_pairs(start)
-    state = jax.lax.platform_dependent(
-        _State(jnp.int32(0), start, first, jnp.array(jnp.inf), jnp.array(True)),
-        cpu=until_still,
-        default=without_asking if config.iterations <= _FEW_ROUNDS else until_still,
-    )
+    state = _State(jnp.int32(0), start, first, jnp.array(jnp.inf), jnp.array(True))
+    state = repeat_while(is_moving, iterate, state, config.iterations)
 
     status = first_status(
         (~valid, PoseStatus.INVALID_INPUT),
@@ -262,6 +245,12 @@ def _icp(
         converged=status == PoseStatus.OK,
         status=status,
     )
+
+
+def motion_between(before: Pose, after: Pose) -> Scalar:
+    """Return how far a small motion has turned a pose, in radians, plus how far it has shifted it."""
+    turned = jnp.sqrt(((after[:3, :3] - before[:3, :3]) ** 2).sum() / 2)
+    return turned + jnp.sqrt(((after[:3, 3] - before[:3, 3]) ** 2).sum())
 
 
 def _robust_weight(residual: Float[Array, " n"], kind: str) -> Float[Array, " n"]:

@@ -129,6 +129,17 @@ def test_parts_too_far_apart_to_touch_are_two_also_if_all_that_is_known_of_one_i
         assert found.kept.tolist() == [True, both]
 
 
+def test_nothing_is_in_a_part_beyond_a_thin_leg_of_which_only_two_points_are_known() -> None:
+    """The nearest bits of what lies below the leg all face upwards: behind them it is not inside."""
+    leg = np.array([[0.05, 0, -1.2], [-0.05, 0, -1.2]], dtype=np.float32)
+    sides = np.array([[0.8, 0, 0.6], [-0.8, 0, 0.6]], dtype=np.float32)
+    points, normals = np.concatenate([leg, BOX.points]), np.concatenate([sides, BOX.normals])
+    legged = replace(BOX, points=points, normals=normals, minimum=points.min(axis=0))
+    for away, both in ((0.4, False), (2.4, True)):
+        found = chosen(np.stack([np.eye(4), moved(0, 0, -away)]), np.array([0.9, 0.8]), part=legged)
+        assert found.kept.tolist() == [True, both]
+
+
 def test_slender_parts_side_by_side_are_two() -> None:
     x, y, z = BOX.maximum - BOX.minimum
     assert same_place(BOX) == pytest.approx(min(0.2 * BOX.diameter, sorted((x, y, z))[1] / 2))
