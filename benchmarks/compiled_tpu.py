@@ -17,6 +17,7 @@ from typing import Any
 from benchmarks.compiled_programs import programs
 from benchmarks.compiled_targets import TARGETS, devices_of, prepare
 from kmn_jax.errors import InputError
+from kmn_jax.platforms import for_any_platform
 
 _PROGRAM = "*.after_optimizations.txt"
 _MEMORY = "*.after_optimizations-buffer-assignment.txt"
@@ -58,4 +59,6 @@ def _compile(target: str, name: str, folder: str) -> None:
     prepare(where)
     program = next(program for program in programs(where.devices) if program.name == name)
     function, arguments = program.make(devices_of(where))
-    function.lower(*arguments).compile(compiler_options={"xla_dump_to": folder})
+    with for_any_platform():
+        lowered = function.lower(*arguments)
+    lowered.compile(compiler_options={"xla_dump_to": folder})

@@ -36,6 +36,7 @@ RANKS = dict.fromkeys(
         "extras",
         "files",
         "limits",
+        "platforms",
         "programs",
         "released",
         "report",

@@ -19,6 +19,7 @@ from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
 from kmn_jax.geometry import Intrinsics, PaddedCloud
 from kmn_jax.objects import Part
+from kmn_jax.platforms import for_any_platform
 
 PLATFORMS = ("cpu", "cuda")
 _SIDE = 512  # pixels along the depth image that is made of the points
@@ -47,7 +48,8 @@ def export_estimator(estimator: PoseEstimator, part: Part, path: str | Path, num
         jax.ShapeDtypeStruct((num_points,), jnp.bool_),
         jax.ShapeDtypeStruct((2,), jnp.uint32),
     )
-    exported = jax_export.export(jax.jit(_program(estimator, part)), platforms=PLATFORMS)(*arguments)
+    with for_any_platform():
+        exported = jax_export.export(jax.jit(_program(estimator, part)), platforms=PLATFORMS)(*arguments)
     content = bytes(exported.serialize())
     write_whole(path, content)
     return len(content)

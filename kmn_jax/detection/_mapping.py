@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from kmn_jax.platforms import by_platform
 from kmn_jax.programs import compiled_size
 
 _Result = TypeVar("_Result")
@@ -19,7 +20,7 @@ _FEWEST = 16  # items that accelerators are given at once
 
 def map_rows(function: Callable[..., _Result], *items: Any) -> _Result:
     """Map a function over leading axes, inside of jit."""
-    return jax.lax.platform_dependent(
+    return by_platform(
         *items,
         cpu=lambda *items: jax.lax.map(lambda item: function(*item), items),
         default=jax.vmap(function),

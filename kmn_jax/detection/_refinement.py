@@ -106,17 +106,14 @@ def refined_forms(
     def raw_score(turned: Pose, is_rival: Bool[Array, ""]) -> Scalar:
         return jax.lax.cond(is_rival, lambda: score(turned, _RAW_TOLERANCE), lambda: unlikely)
 
-    def roughly_refined(start: Pose, is_rival: Bool[Array, ""]) -> tuple[Pose, Scalar]:
-        def both() -> tuple[Pose, Scalar]:
-            rough = refined(start, _ROUGH_POINTS, _ROUGH_ICP)
-            return rough, score(rough, _TOLERANCE)
-
-        return jax.lax.cond(is_rival, both, lambda: (start, unlikely))
+    def roughly_refined(start: Pose, there: Bool[Array, ""]) -> Pose:
+        return jax.lax.cond(there, lambda: refined(start, _ROUGH_POINTS, _ROUGH_ICP), lambda: start)
 
     hope, rows = jax.lax.top_k(map_rows(raw_score, turned, part.is_rival), _ROUGH_TURNS)
-    rough, scores = map_rows(roughly_refined, turned[rows], jnp.isfinite(hope))
-    best, rows = jax.lax.top_k(scores, ALTERNATIVES)
-    there = jnp.concatenate([jnp.ones(1, dtype=bool), best >= score(pose, _TOLERANCE) - margin])
+    rough = map_rows(roughly_refined, turned[rows], jnp.isfinite(hope))
+    scores = map_rows(lambda pose: score(pose, _TOLERANCE), jnp.concatenate([pose[None], rough]))
+    best, rows = jax.lax.top_k(jnp.where(jnp.isfinite(hope), scores[1:], unlikely), ALTERNATIVES)
+    there = jnp.concatenate([jnp.ones(1, dtype=bool), best >= scores[0] - margin])
 
     def finish(start: Pose, there: Bool[Array, ""]) -> Pose:
         return jax.lax.cond(there, lambda: refined(start, _ICP_POINTS, _ICP), lambda: start)

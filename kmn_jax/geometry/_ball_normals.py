@@ -13,6 +13,7 @@ from kmn_jax.errors import positive_scalar
 from kmn_jax.geometry._knn import squared_distances
 from kmn_jax.geometry._normals import _plane_normals
 from kmn_jax.geometry._rows import real_rows
+from kmn_jax.platforms import by_platform
 from kmn_jax.typing import Scalar
 
 _CPU_BLOCK = 64  # queries at once: their distances to a few thousand points stay in a core's cache
@@ -75,9 +76,7 @@ def planes_within_radius(
         return jax.lax.map(sums, blocks).reshape(-1, 16)[:count]
 
     large = max(1, min(count, _MOST_DISTANCES // points.shape[0]))
-    found = jax.lax.platform_dependent(
-        queries, cpu=partial(in_blocks, size=_CPU_BLOCK), default=partial(in_blocks, size=large)
-    )
+    found = by_platform(queries, cpu=partial(in_blocks, size=_CPU_BLOCK), default=partial(in_blocks, size=large))
     number, *rest = found[:, : len(columns)].T
     normals, valid = _plane_normals(number, rest[:3], rest[3:])
     number = jnp.maximum(number, 1)

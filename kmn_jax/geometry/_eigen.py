@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from kmn_jax.platforms import by_platform
 from kmn_jax.typing import Scalar
 
 _SQUARINGS = 24  # 2**24 power iterations: eigenvalues closer than float32 can tell apart no longer matter
@@ -43,7 +44,7 @@ def dominant_eigenvector(matrix: Float[Array, "d d"]) -> Float[Array, " d"]:
         rows = jax.lax.fori_loop(0, _SQUARINGS, square, rows, unroll=_AT_ONCE)
         return tuple(row[0] for row in rows)
 
-    projector = jax.lax.platform_dependent(
+    projector = by_platform(
         *normalised, cpu=lambda *m: jax.lax.fori_loop(0, _SQUARINGS, square, m), default=in_few_kernels
     )
     largest, column = projector[0], [projector[entry[0, j]] for j in range(size)]

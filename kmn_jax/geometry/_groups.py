@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from kmn_jax.geometry._knn import first_smallest, squared_distances
+from kmn_jax.platforms import by_platform
 from kmn_jax.typing import Scalar
 
 _MOST = 32  # points of a group
@@ -40,7 +41,7 @@ def group_points(points: Float[Array, "n 3"], mask: Bool[Array, " n"] | None = N
     spare = -(-count // groups) * groups - count
     real = jnp.ones(count, dtype=bool) if mask is None else mask
     places = jnp.pad(jnp.where(real[:, None], points, jnp.inf), ((0, spare), (0, 0)), constant_values=jnp.inf)
-    rows = jax.lax.platform_dependent(
+    rows = by_platform(
         places,
         cpu=lambda places: _split(places, groups),
         default=lambda places: jnp.arange(count + spare, dtype=jnp.int32),
@@ -57,7 +58,7 @@ def nearest_within(
     together the queries of a block are: best as `group_points` put them, wherever they moved as one since. Queries
     where `mask` is false must be finite, and their result means nothing.
     """
-    rows, squares = jax.lax.platform_dependent(
+    rows, squares = by_platform(
         queries, mask, groups, jnp.asarray(reach, dtype=jnp.float32), cpu=_of_near_groups, default=_of_all
     )
     distance = jnp.sqrt(squares)

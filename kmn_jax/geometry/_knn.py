@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from kmn_jax.errors import InputError
 from kmn_jax.geometry._selection import largest_in_any_order
+from kmn_jax.platforms import by_platform
 
 _COORDINATES = 3
 _FAR = 1e38  # of masked points, half a squared distance: infinities become no numbers where products are split
@@ -52,7 +53,7 @@ def k_nearest(
     if queries.shape[0] == 0:
         return jnp.zeros((0, k), dtype=jnp.int32)
     queries, points = _centered(queries, points, mask)
-    selected = jax.lax.platform_dependent(
+    selected = by_platform(
         queries,
         points,
         mask,
@@ -71,7 +72,7 @@ def neighbor_graph(points: Float[Array, "n c"], k: int, mask: Bool[Array, " n"] 
     """
     _check_k(k, points.shape[0])
     points, _ = _centered(points, points, mask)
-    selected = jax.lax.platform_dependent(
+    selected = by_platform(
         points,
         mask,
         cpu=partial(_k_smallest_own_part_first, k=k),

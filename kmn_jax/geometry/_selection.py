@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float32, Int, Shaped
 
+from kmn_jax.platforms import by_platform
+
 # From version 0.11 on JAX takes a promise back; before that, XLA has to be told: see `ask_for_fast_selection`.
 _ANY_TIES = {"is_stable": False} if "is_stable" in inspect.signature(jax.lax.top_k).parameters else {}
 _FLAG = "xla_gpu_experimental_use_raft_select_k"
@@ -21,9 +23,12 @@ _GPU_PACKAGES = ("jax_cuda12_plugin", "jax_cuda13_plugin")
 
 def largest(values: Shaped[Array, "... n"], k: int) -> tuple[Shaped[Array, "... k"], Int[Array, "... k"]]:
     """Return the k largest of each row, in order, and their places; on CPUs, the first of equal ones come first."""
-    return jax.lax.platform_dependent(
-        values, cpu=lambda values: tuple(jax.lax.top_k(values, k)), default=partial(largest_in_any_order, k=k)
-    )
+
+    def in_order(values: Shaped[Array, "... n"]) -> tuple[Shaped[Array, "... k"], Int[Array, "... k"]]:
+        best, places = jax.lax.top_k(values, k)
+        return best, places
+
+    return by_platform(values, cpu=in_order, default=partial(largest_in_any_order, k=k))
 
 
 def largest_in_any_order(values: Shaped[Array, "... n"], k: int) -> tuple[Shaped[Array, "... k"], Int[Array, "... k"]]:
@@ -44,9 +49,7 @@ def largest_in_any_order(values: Shaped[Array, "... n"], k: int) -> tuple[Shaped
 
 def smallest_at(values: Float32[Array, " n"], place: Int[Array, ""]) -> Float32[Array, ""]:
     """Return the number at a place among n in order, the smallest at 0; none may be below zero, inf may be there."""
-    return jax.lax.platform_dependent(
-        values, place, cpu=smallest_by_bits, default=lambda values, place: jnp.sort(values)[place]
-    )
+    return by_platform(values, place, cpu=smallest_by_bits, default=lambda values, place: jnp.sort(values)[place])
 
 
 def smallest_by_bits(values: Float32[Array, " n"], place: Int[Array, ""]) -> Float32[Array, ""]:

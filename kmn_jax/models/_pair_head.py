@@ -26,6 +26,7 @@ from kmn_jax.models._layers import (
     leaky_relu,
     product,
 )
+from kmn_jax.platforms import by_platform
 
 PairDropout = Literal["shared", "per_pair"]
 
@@ -104,7 +105,7 @@ def pairwise_leaky_sum(
     own = jnp.matmul(weights * u, ones, precision=jax.lax.Precision.HIGHEST)
     linear = own + jnp.matmul(weights, v.T, precision=jax.lax.Precision.HIGHEST)
     on_cpu = pairwise_absolute_blocks if weights.shape[0] == 1 else pairwise_absolute_scan
-    absolute = jax.lax.platform_dependent(u, v, weights, cpu=on_cpu, default=pairwise_absolute_fused)
+    absolute = by_platform(u, v, weights, cpu=on_cpu, default=pairwise_absolute_fused)
     return 0.6 * linear + 0.4 * absolute
 
 

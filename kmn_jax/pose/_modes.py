@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from kmn_jax.geometry import from_rotation_translation
+from kmn_jax.platforms import by_platform
 from kmn_jax.pose._kabsch import best_rotation, fit_rigid, rotation_is_determined, spread_is_determined
 from kmn_jax.typing import Mask, Normals, Points, Pose, Scalar
 
@@ -53,7 +54,7 @@ def refined_modes(
     poses: Float[Array, "h 4 4"], scores: Int[Array, " h"], pairs: Pairs, gates: Float[Array, " r"], count: int
 ) -> tuple[Float[Array, "m 4 4"], Bool[Array, " m"]]:
     """Return `count` refitted poses that differ, best first, and which of them there are; scores below 0 are none."""
-    return jax.lax.platform_dependent(
+    return by_platform(
         poses, scores, pairs, gates, cpu=partial(_in_turn, count=count), default=partial(_at_once, count=count)
     )
 

@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from kmn_jax.platforms import by_platform
+
 _FEW = 20  # rounds up to which accelerators make all of them: they cost less than to wait for each one's answer
 
 _State = TypeVar("_State")
@@ -31,4 +33,4 @@ def repeat_while(
 
         return jax.lax.scan(step_if_moving, state, length=most)[0]
 
-    return jax.lax.platform_dependent(state, cpu=until_still, default=without_asking if most <= _FEW else until_still)
+    return by_platform(state, cpu=until_still, default=without_asking if most <= _FEW else until_still)

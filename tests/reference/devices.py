@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import jax
 import pytest
 
+from kmn_jax import platforms
 from kmn_jax.geometry import _eigen
 
 
@@ -20,11 +20,11 @@ def accelerator_forms() -> Iterator[list[Any]]:
     """
     asked: list[Any] = []
 
-    def other_form(*arguments: Any, default: Callable[..., Any], **_: Any) -> Any:
+    def other_form(cpu: Callable[..., Any], default: Callable[..., Any]) -> Callable[..., Any]:
         asked.append(default)
-        return default(*arguments)
+        return default
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jax.lax, "platform_dependent", other_form)
+        patch.setattr(platforms, "own_form", other_form)
         patch.setattr(_eigen, "_AT_ONCE", 3)  # longer pieces take long to compile
         yield asked
