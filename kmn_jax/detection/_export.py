@@ -48,8 +48,9 @@ def export_estimator(estimator: PoseEstimator, part: Part, path: str | Path, num
         jax.ShapeDtypeStruct((num_points,), jnp.bool_),
         jax.ShapeDtypeStruct((2,), jnp.uint32),
     )
+    program = jax.jit(_program(estimator, part))
     with for_any_platform():
-        exported = jax_export.export(jax.jit(_program(estimator, part)), platforms=PLATFORMS)(*arguments)
+        exported = jax_export.export(program, platforms=PLATFORMS)(*arguments)
     content = bytes(exported.serialize())
     write_whole(path, content)
     return len(content)

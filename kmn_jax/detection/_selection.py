@@ -115,9 +115,8 @@ def _shares_in_box(T_other_own: Float[Array, "s 4 4"], points: Points, margin: S
 def overlap(pose: Pose, other: Pose, points: Points, normals: Normals, spacing: Scalar, depth: Scalar) -> Scalar:
     """Return which share of the points of one part is in or on the other, the larger of the two.
 
-    Points deeper than `depth` below the other's surface are in it, within its hull; nearer ones with a normal like its
-    own are on it.
-    `spacing` is how far the points are apart.
+    Points deeper than `depth` below the other's surface, within its hull, are in it; nearer ones with a normal like its
+    own are on it. `spacing` is how far the points are apart.
     """
 
     def share(pose: Pose, other: Pose) -> Scalar:
@@ -141,7 +140,8 @@ def share_inside(
     # Beyond an edge a point is below one face, but not below all that are about as near.
     height = jnp.where(away <= nearest + spacing, heights, -jnp.inf).max(axis=1)
     # Where points are sparse, those about as near may all be turned away; outside of the hull nothing is inside.
-    in_hull = (heights <= (along.max(axis=0) - offsets)[None]).all(axis=1)
+    in_box = ((seen >= points.min(axis=0)[None]) & (seen <= points.max(axis=0)[None])).all(axis=1)
+    in_hull = in_box & (heights <= (along.max(axis=0) - offsets)[None]).all(axis=1)
     row = jnp.argmin(away, axis=1)
     turned = jnp.matmul(own[1], T_other_own[:3, :3].T, precision=highest)
     alike = (turned * normals[row]).sum(axis=1) > _ALIKE  # where parts touch, they are opposite

@@ -21,7 +21,7 @@ from kmn_jax.detection import (
     symmetry_transforms,
 )
 from kmn_jax.detection import chosen as choose_candidates
-from kmn_jax.detection._selection import _greedy, overlap
+from kmn_jax.detection._selection import _greedy, overlap, share_inside
 from kmn_jax.objects import Part, PartArrays, Symmetries
 from kmn_jax.objects._symmetry import rotation_about
 from kmn_jax.pose import mssd
@@ -134,10 +134,24 @@ def test_nothing_is_in_a_part_beyond_a_thin_leg_of_which_only_two_points_are_kno
     leg = np.array([[0.05, 0, -1.2], [-0.05, 0, -1.2]], dtype=np.float32)
     sides = np.array([[0.8, 0, 0.6], [-0.8, 0, 0.6]], dtype=np.float32)
     points, normals = np.concatenate([leg, BOX.points]), np.concatenate([sides, BOX.normals])
+    surface, spacing = (jnp.asarray(points), jnp.asarray(normals)), jnp.float32((BOX.area / len(points)) ** 0.5)
+    below = jnp.asarray(moved(0, 0, -2.4), jnp.float32)
+    assert overlap(jnp.eye(4), below, *surface, spacing, jnp.float32(0.1)) == 0
     legged = replace(BOX, points=points, normals=normals, minimum=points.min(axis=0))
     for away, both in ((0.4, False), (2.4, True)):
         found = chosen(np.stack([np.eye(4), moved(0, 0, -away)]), np.array([0.9, 0.8]), part=legged)
         assert found.kept.tolist() == [True, both]
+
+
+def test_nothing_is_in_a_surface_of_one_side_but_within_its_box() -> None:
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 12), np.linspace(-0.5, 0.5, 12))
+    cap = np.stack([x, y, 0.5 - x**2 - y**2], axis=-1).reshape(-1, 3).astype(np.float32)
+    upwards = np.stack([2 * x, 2 * y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    known = jnp.asarray(cap), jnp.asarray(upwards / np.linalg.norm(upwards, axis=1, keepdims=True), jnp.float32)
+    block = 0.05 * jnp.asarray(BOX.points[:144]), jnp.asarray(BOX.normals[:144])
+    for height, share in ((0.2, 1.0), (-0.5, 0.0)):
+        place = jnp.asarray(moved(0, 0, height), jnp.float32)
+        assert share_inside(place, block, known, jnp.float32(0.1), jnp.float32(0.05)) == share
 
 
 def test_slender_parts_side_by_side_are_two() -> None:
