@@ -103,13 +103,12 @@ def _greedy(
 
 def _shares_in_box(T_other_own: Float[Array, "s 4 4"], points: Points, margin: Scalar) -> Float[Array, " s"]:
     """Return which share of the points of one part lies in the other's box: the others are neither in nor on it."""
+    return jax.vmap(lambda pose: _in_box(transform_points(pose, points), points, margin).mean())(T_other_own)
+
+
+def _in_box(seen: Float[Array, "q 3"], points: Points, margin: Scalar | float) -> Bool[Array, " q"]:
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
-
-    def share(pose: Pose) -> Scalar:
-        moved = transform_points(pose, points)
-        return ((moved >= low[None]) & (moved <= high[None])).all(axis=1).mean()
-
-    return jax.vmap(share)(T_other_own)
+    return ((seen >= low[None]) & (seen <= high[None])).all(axis=1)
 
 
 def overlap(pose: Pose, other: Pose, points: Points, normals: Normals, spacing: Scalar, depth: Scalar) -> Scalar:
@@ -140,8 +139,7 @@ def share_inside(
     # Beyond an edge a point is below one face, but not below all that are about as near.
     height = jnp.where(away <= nearest + spacing, heights, -jnp.inf).max(axis=1)
     # Where points are sparse, those about as near may all be turned away; outside of the hull nothing is inside.
-    in_box = ((seen >= points.min(axis=0)[None]) & (seen <= points.max(axis=0)[None])).all(axis=1)
-    in_hull = in_box & (heights <= (along.max(axis=0) - offsets)[None]).all(axis=1)
+    in_hull = _in_box(seen, points, 0.0) & (heights <= (along.max(axis=0) - offsets)[None]).all(axis=1)
     row = jnp.argmin(away, axis=1)
     turned = jnp.matmul(own[1], T_other_own[:3, :3].T, precision=highest)
     alike = (turned * normals[row]).sum(axis=1) > _ALIKE  # where parts touch, they are opposite
