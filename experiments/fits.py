@@ -23,7 +23,7 @@ from kmn_jax.detection import (
     keeps_order,
     vouched,
 )
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, require
 
 _SCALE_RIDGE = 1e-4  # hardly any: it makes probabilities too modest
 
@@ -36,6 +36,11 @@ class FitOptions:
     members: int = 3  # fits, whose mean is the model of refined poses
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
     reported_weight: float = 8.0  # of poses that detection reports: what is said of them is what users are told
+    in_vain: float | None = None  # the share of searches for parts that are not there, as is told; else that of them
+
+    def __post_init__(self) -> None:
+        """Refuse values that contradict their meaning."""
+        require(self.in_vain is None or 0 < self.in_vain < 1, f"in_vain = {self.in_vain} must be between 0 and 1")
 
 
 def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -97,7 +102,8 @@ def fit(poses: dict[str, np.ndarray], options: FitOptions) -> Fitted:
     """Fit a model of evidence.
 
     Of all poses it must be `told` whether they are right. Where some are those that detection reports, the scale of the
-    model is fitted to them, as models of other objects predict them, and they are what is judged.
+    model is fitted to them, as models of other objects predict them, and they are what is judged, as if the share of searches
+    that is asked for was in vain.
     """
     right = poses["error"] < THRESHOLD
     held_out = np.zeros(len(right))
@@ -105,14 +111,15 @@ def fit(poses: dict[str, np.ndarray], options: FitOptions) -> Fitted:
         own = np.isin(poses["object"], names)
         held_out[own] = others.logit(poses["evidence"][own])
     model = model_of(poses, options)
-    judged = np.ones_like(right)
-    if poses["reported"].any():
-        judged = poses["reported"]
-        scale = fit_logistic(held_out[judged, None], right[judged], ("logit",), _SCALE_RIDGE)
-        if scale.weights[0] <= 0:
-            raise InputError("poses are right no more often where models of other objects say so: give more bins")
-        model, held_out = model.scaled(scale.weights[0], scale.bias), scale.weights[0] * held_out + scale.bias
-    return Fitted(model, held_out, _judged({name: values[judged] for name, values in poses.items()}, held_out[judged]))
+    if not poses["reported"].any():
+        return Fitted(model, held_out, _judged(poses, held_out, np.ones(len(right))))
+    judged, told_of = _reported(poses), held_out[poses["reported"]]
+    counts = _as_asked(judged, options)
+    scale = fit_logistic(told_of[:, None], right[poses["reported"]], ("logit",), _SCALE_RIDGE, weights=counts)
+    if scale.weights[0] <= 0:
+        raise InputError("poses are right no more often where models of other objects say so: give more bins")
+    model, held_out = model.scaled(scale.weights[0], scale.bias), scale.weights[0] * held_out + scale.bias
+    return Fitted(model, held_out, _judged(judged, held_out[poses["reported"]], counts))
 
 
 def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: FitOptions) -> Fitted:
@@ -121,8 +128,7 @@ def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], 
     What is judged are all reported poses, of which those of other searches, and those that are alone, keep their odds.
     Raises InputError if no two poses are reported of one such search, or the less sure ones are right.
     """
-    logits = logits[poses["reported"]]
-    poses = {name: values[poses["reported"]] for name, values in poses.items()}
+    logits, poses = logits[poses["reported"]], _reported(poses)
     right, together = poses["error"] < THRESHOLD, poses["narrowed"].copy()
     rows_of = [np.flatnonzero(poses["search"] == search) for search in np.unique(poses["search"])]
     columns = np.zeros((len(logits), len(COMPANY)))
@@ -146,11 +152,26 @@ def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], 
             for rows in rows_of:
                 if own[rows].any():
                     held_out[rows] = vouched(logits[rows], others)
-    return Fitted(of_company(together), held_out, _judged(poses, held_out))
+    return Fitted(of_company(together), held_out, _judged(poses, held_out, _as_asked(poses, options)))
 
 
-def _judged(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"]) -> dict[str, Any]:
-    """Return how well log odds predict which poses are right."""
+def _reported(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {name: values[poses["reported"]] for name, values in poses.items()}
+
+
+def _as_asked(poses: dict[str, np.ndarray], options: FitOptions) -> Float[np.ndarray, " s"]:
+    """Return how much reported poses count, for the share of searches in vain, among those with any, that is told."""
+    absent = ~np.isfinite(poses["error"])
+    in_vain, others = (len(np.unique(poses["search"][of])) for of in (absent, ~absent))
+    if options.in_vain is None or not in_vain or not others:
+        return np.ones(len(absent))
+    return np.where(absent, options.in_vain / (1 - options.in_vain) * others / in_vain, 1.0)
+
+
+def _judged(
+    poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], counts: Float[np.ndarray, " s"]
+) -> dict[str, Any]:
+    """Return how well log odds predict which poses are right, where some count as several."""
     right, there = poses["error"] < THRESHOLD, np.isfinite(poses["error"])
     probability = 1 / (1 + np.exp(-logits))
     accepted = probability >= DetectConfig().accepted
@@ -159,9 +180,11 @@ def _judged(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"]) -> di
         "objects": len(np.unique(poses["object"])),
         "poses": len(right),
         "right": float(right.mean()),
-        "expected calibration error": expected_calibration_error(probability, right),
+        "expected calibration error": expected_calibration_error(probability, right, weights=counts),
+        "searched in vain": len(np.unique(poses["search"][~there])),
+        "accepted there": int((accepted & ~there).sum()),
         "right among accepted": float(right[accepted].mean()) if accepted.any() else None,
         "right among accepted where the part is": float(right[present].mean()) if present.any() else None,
         "accepted among right": float(accepted[right].mean()),
     }
-    return {"summary": summary, "reliability": reliability_table(probability, right)}
+    return {"summary": summary, "reliability": reliability_table(probability, right, counts)}

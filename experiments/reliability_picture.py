@@ -18,11 +18,15 @@ Row = Mapping[str, float]
 _MOST_CURVES, _COLUMNS = 4, 5  # in one panel; of panels
 
 
-def reliability_table(probability: Float[np.ndarray, " s"], right: Bool[np.ndarray, " s"]) -> list[Row]:
-    """Return rows of mean probability, share of right poses and their number."""
+def reliability_table(
+    probability: Float[np.ndarray, " s"],
+    right: Bool[np.ndarray, " s"],
+    weights: Float[np.ndarray, " s"] | None = None,
+) -> list[Row]:
+    """Return rows of mean probability, share of right poses and their number; `weights` count some as several."""
     return [
         {"probability": mean, "share right": share, "poses": count}
-        for mean, share, count in reliability(probability, right)
+        for mean, share, count in reliability(probability, right, weights=weights)
     ]
 
 

@@ -105,11 +105,20 @@ def _logistic(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
 
 
 def expected_calibration_error(
-    probability: Float[np.ndarray, " s"], right: Bool[np.ndarray, " s"], bins: int = 10
+    probability: Float[np.ndarray, " s"],
+    right: Bool[np.ndarray, " s"],
+    bins: int = 10,
+    weights: Float[np.ndarray, " s"] | None = None,
 ) -> float:
-    """Return the mean difference of probability and share of right poses over equal ranges of probability."""
-    rows = reliability(probability, right, bins)
-    return float(sum(count * abs(mean - share) for mean, share, count in rows) / max(len(right), 1))
+    """Return the mean difference of probability and share of right poses over equal ranges of probability.
+
+    `weights` count some poses as several.
+    """
+    weights = np.ones(len(right)) if weights is None else weights
+    rows = reliability(probability, right, bins, weights)
+    counts = [weights[own].sum() for own in _ranges(probability, bins)]
+    error = sum(count * abs(mean - share) for count, (mean, share, _) in zip(counts, rows, strict=True))
+    return float(error / max(weights.sum(), 1e-9))
 
 
 def chance_calibration_error(probability: Float[np.ndarray, " s"], bins: int = 10, draws: int = 200) -> float:
@@ -126,12 +135,27 @@ def chance_calibration_error(probability: Float[np.ndarray, " s"], bins: int = 1
 
 
 def reliability(
-    probability: Float[np.ndarray, " s"], right: Bool[np.ndarray, " s"], bins: int = 10
+    probability: Float[np.ndarray, " s"],
+    right: Bool[np.ndarray, " s"],
+    bins: int = 10,
+    weights: Float[np.ndarray, " s"] | None = None,
 ) -> list[tuple[float, float, int]]:
-    """Return mean probability, share of right poses and their number for each range of probability that has any."""
+    """Return mean probability, share of right poses and their number for each range of probability that has any.
+
+    `weights` count some poses as several in the mean and the share.
+    """
+    weights = np.ones(len(right)) if weights is None else weights
+
+    def mean(values: Bool[np.ndarray, " s"] | Float[np.ndarray, " s"], own: Bool[np.ndarray, " s"]) -> float:
+        return float(np.average(values[own], weights=weights[own]))
+
+    return [(mean(probability, own), mean(right, own), int(own.sum())) for own in _ranges(probability, bins)]
+
+
+def _ranges(probability: Float[np.ndarray, " s"], bins: int) -> list[Bool[np.ndarray, " s"]]:
+    """Return which poses are in each range of probability that has any."""
     place = np.minimum((probability * bins).astype(int), bins - 1)
-    chosen = [place == row for row in range(bins)]
-    return [(float(probability[own].mean()), float(right[own].mean()), int(own.sum())) for own in chosen if own.any()]
+    return [place == row for row in range(bins) if (place == row).any()]
 
 
 COMPANY = ("own", "best")  # the evidence of `together`, see `company`

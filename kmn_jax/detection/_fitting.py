@@ -108,9 +108,14 @@ def _fill(
 
 
 def fit_logistic(
-    columns: Float[np.ndarray, "s f"], right: Bool[np.ndarray, " s"], names: Sequence[str], ridge: float
+    columns: Float[np.ndarray, "s f"],
+    right: Bool[np.ndarray, " s"],
+    names: Sequence[str],
+    ridge: float,
+    weights: Float[np.ndarray, " s"] | None = None,
 ) -> Calibration:
-    """Fit a logistic model of columns, with a ridge on the weights of standardised ones.
+    """Fit a logistic model of columns, with a ridge on the weights of standardised ones; `weights` count some rows as
+    several.
 
     Raises InputError if all are right or all are wrong.
     """
@@ -121,17 +126,19 @@ def fit_logistic(
     scale = np.where(scale > 0, scale, 1)
     standard = np.append((columns - mean) / scale, np.ones((len(right), 1)), axis=1)
     ridges = np.append(np.full(columns.shape[1], ridge), 0)
+    counts = np.ones(len(right)) if weights is None else weights
+    counts = counts / counts.sum()
 
     def loss(solution: Float[np.ndarray, " g"]) -> tuple[float, Float[np.ndarray, " g"]]:
         logits = standard @ solution
-        value = np.mean(np.logaddexp(0, logits) - right * logits) + ridges @ solution**2 / 2
+        value = counts @ (np.logaddexp(0, logits) - right * logits) + ridges @ solution**2 / 2
         error = np.exp(-np.logaddexp(0, -logits)) - right
-        return float(value), standard.T @ error / len(right) + ridges * solution
+        return float(value), standard.T @ (counts * error) + ridges * solution
 
     start = np.zeros(standard.shape[1])
-    *weights, bias = minimize(loss, start, jac=True, method="L-BFGS-B", options={"ftol": 1e-12, "gtol": 1e-8}).x
-    weights = np.array(weights) / scale
-    return Calibration(tuple(names), tuple(weights.tolist()), float(bias - weights @ mean))
+    *slopes, bias = minimize(loss, start, jac=True, method="L-BFGS-B", options={"ftol": 1e-12, "gtol": 1e-8}).x
+    slopes = np.array(slopes) / scale
+    return Calibration(tuple(names), tuple(slopes.tolist()), float(bias - slopes @ mean))
 
 
 def _check(right: Bool[np.ndarray, " s"]) -> None:

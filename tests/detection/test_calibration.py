@@ -205,6 +205,22 @@ def test_reliability_counts_every_pose_once() -> None:
     np.testing.assert_allclose([mean for mean, _, _ in rows], [0.025, 0.55, 1.0])
 
 
+def test_what_counts_twice_is_as_if_it_was_there_twice() -> None:
+    evidence, right = drawn(300)
+    rng = np.random.default_rng(1)
+    weights, probability = rng.integers(1, 4, len(right)).astype(float), rng.random(len(right))
+    twice = np.repeat(np.arange(len(right)), weights.astype(int))
+    assert expected_calibration_error(probability, right, weights=weights) == pytest.approx(
+        expected_calibration_error(probability[twice], right[twice])
+    )
+    rows, repeated = reliability(probability, right, weights=weights), reliability(probability[twice], right[twice])
+    np.testing.assert_allclose([row[:2] for row in rows], [row[:2] for row in repeated])
+    assert sum(count for _, _, count in rows) == len(right)
+    fitted = fit_logistic(evidence, right, NAMES, 0.0, weights)
+    again = fit_logistic(evidence[twice], right[twice], NAMES, 0.0)
+    np.testing.assert_allclose((*fitted.weights, fitted.bias), (*again.weights, again.bias), rtol=1e-4)
+
+
 def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.calibration.json"
     logistic = Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25)

@@ -23,6 +23,7 @@ def drawn(random_seed: int, objects: int = _OBJECTS, spread: float = 1.0, oddity
         "evidence": evidence.reshape(-1, _COLUMNS),
         "error": np.where(right, 0.01, np.where(rng.random(right.shape) < 0.3, np.inf, 0.5)).reshape(-1),
         "object": np.repeat(np.arange(objects), _POSES),
+        "search": np.repeat(np.arange(objects), _POSES),
         "refined": np.ones(right.size, dtype=bool),
         "reported": rng.random(right.size) < 0.9,
     }
@@ -46,6 +47,28 @@ def test_probabilities_hold_for_objects_of_other_kinds() -> None:
     assert error < 0.7 * before
     order = np.argsort(plain.probability(evidence), kind="stable")
     assert (np.diff(model.probability(evidence[order])) >= -1e-9).all()  # the scale alone is another
+
+
+def test_probabilities_are_told_as_if_a_share_of_the_searches_was_in_vain() -> None:
+    poses = drawn(0, 40)
+    # Of half of the objects the part is never there; how much else is searched in vain is another matter.
+    absent = poses["object"] % 2 == 1
+    poses["error"] = np.where(absent, np.inf, np.where(np.isinf(poses["error"]), 0.5, poses["error"]))
+    seldom, often = (fit(poses, FitOptions(members=1, in_vain=share)) for share in (0.1, 0.5))
+    told = [fitted.model.probability(poses["evidence"]) for fitted in (seldom, often)]
+    assert (told[0] > told[1])[told[0] > 0.1].all()
+    right, reported = poses["error"] < 0.1, poses["reported"]
+    for share, fitted in ((0.1, seldom), (0.5, often)):
+        counts = np.where(absent, share / (1 - share), 1.0)[reported]  # there are as many searches of either kind
+        probability = 1 / (1 + np.exp(-fitted.held_out[reported]))
+        assert np.average(probability, weights=counts) == pytest.approx(
+            np.average(right[reported], weights=counts), rel=1e-3
+        )
+        error = expected_calibration_error(probability, right[reported], weights=counts)
+        assert fitted.results["summary"]["expected calibration error"] == pytest.approx(error)
+    assert often.results["summary"]["searched in vain"] == 20
+    with pytest.raises(InputError, match="between 0 and 1"):
+        FitOptions(in_vain=1.0)
 
 
 def test_poses_of_scenes_where_the_part_is_vouch_for_each_other() -> None:
