@@ -20,7 +20,7 @@ from kmn_jax.io import Scan
 from kmn_jax.objects import ObjectConfig, Part, PartArrays, object_from_mesh
 from kmn_jax.objects._symmetry import rotation_about
 from kmn_jax.pose import mssd
-from kmn_jax.simulate import RayMesh, Surfels, render
+from kmn_jax.simulate import RayMesh, Surfels, render, visible_by_splatting
 from tests.reference.meshes import Mesh, camera_scene, notched_box, pose, random_rotations, tube
 from tests.reference.parts import box_part
 
@@ -192,6 +192,20 @@ def test_polished_poses_are_those_of_the_image(
     for seed in range(3):
         found = POLISHED(jnp.asarray(moved(TRUE, seed, 2.0, 0.015 * diameter)), on_device, image)
         assert float(mssd(found, TRUE.astype(np.float32), part.points[:300])) < bound * diameter
+
+
+def test_a_part_that_shows_most_of_its_surface_is_polished_by_a_share_of_it() -> None:
+    corners = np.array([(-0.5, -0.3, 0), (0.5, -0.4, 0), (0.4, 0.3, 0), (-0.5, 0.5, 0), (0.1, 0.05, -0.8)])
+    pyramid = corners, np.array([(0, 2, 1), (0, 3, 2), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)])[:, ::-1]
+    of_pyramid, apex_first = of_mesh(pyramid), pose((0.05, -0.02, 3.0))
+    image = view_of(pyramid, apex_first).image
+    on_device = device_of(of_pyramid, np.zeros(MOST, dtype=bool))
+    seen = visible_by_splatting(on_device.surfels, jnp.asarray(apex_first)[None], jnp.ones(1, dtype=bool), image.camera)
+    assert seen.mask.mean() > 0.6
+    start = moved(apex_first, 0, 2.0, 0.015 * of_pyramid.diameter)
+    found = POLISHED(jnp.asarray(start), on_device, image)
+    before, after = (float(mssd(at, apex_first.astype(np.float32), of_pyramid.points[:300])) for at in (start, found))
+    assert after < 0.002 * of_pyramid.diameter < 0.1 * before
 
 
 def test_polishing_leaves_what_nothing_was_measured_of(part: Part, scene: Scene) -> None:

@@ -154,6 +154,20 @@ def test_nothing_is_in_a_surface_of_one_side_but_within_its_box() -> None:
         assert share_inside(place, block, known, jnp.float32(0.1), jnp.float32(0.05)) == share
 
 
+def test_nothing_is_in_a_part_beyond_its_hull_though_within_its_box() -> None:
+    """Beyond a thin leg again, whose known bits face upwards; another leg reaches farther down on the other side."""
+    legs = np.array([[1.05, 0, -1.2], [0.95, 0, -1.2], [-1.5, 0, -2.4]], dtype=np.float32)
+    sides = np.array([[0.8, 0, 0.6], [-0.8, 0, 0.6], [0.7071, 0, -0.7071]], dtype=np.float32)
+    known = jnp.asarray(np.concatenate([legs, BOX.points])), jnp.asarray(np.concatenate([sides, BOX.normals]))
+    block = 0.05 * (known[0] - known[0].mean(axis=0, keepdims=True)), known[1]
+    low, high = (np.asarray(bound(known[0], axis=0)) for bound in (jnp.min, jnp.max))
+    for at, share in (((0.9, 0, -2.0), 0.0), ((0, 0, 0), 1.0)):
+        place = jnp.asarray(moved(*at), jnp.float32)
+        points = np.asarray(block[0]) + np.array(at)
+        assert ((points > low) & (points < high)).all()
+        assert share_inside(place, block, known, jnp.float32(0.1), jnp.float32(0.05)) == share
+
+
 def test_slender_parts_side_by_side_are_two() -> None:
     x, y, z = BOX.maximum - BOX.minimum
     assert same_place(BOX) == pytest.approx(min(0.2 * BOX.diameter, sorted((x, y, z))[1] / 2))
