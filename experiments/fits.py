@@ -102,8 +102,8 @@ def fit(poses: dict[str, np.ndarray], options: FitOptions) -> Fitted:
     """Fit a model of evidence.
 
     Of all poses it must be `told` whether they are right. Where some are those that detection reports, the scale of the
-    model is fitted to them, as models of other objects predict them, and they are what is judged, as if the share of searches
-    that is asked for was in vain.
+    model is fitted to them, as models of other objects predict them, and they are what is judged, as if the share of
+    searches that is asked for was in vain.
     """
     right = poses["error"] < THRESHOLD
     held_out = np.zeros(len(right))
