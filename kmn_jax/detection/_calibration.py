@@ -114,11 +114,9 @@ def expected_calibration_error(
 
     `weights` count some poses as several.
     """
-    weights = np.ones(len(right)) if weights is None else weights
-    rows = reliability(probability, right, bins, weights)
-    counts = [weights[own].sum() for own in _ranges(probability, bins)]
-    error = sum(count * abs(mean - share) for count, (mean, share, _) in zip(counts, rows, strict=True))
-    return float(error / max(weights.sum(), 1e-9))
+    rows = _by_range(probability, right, bins, weights)
+    total = sum(weight for *_, weight in rows)
+    return sum(weight * abs(mean - share) for mean, share, _, weight in rows) / max(total, 1e-9)
 
 
 def chance_calibration_error(probability: Float[np.ndarray, " s"], bins: int = 10, draws: int = 200) -> float:
@@ -144,18 +142,23 @@ def reliability(
 
     `weights` count some poses as several in the mean and the share.
     """
+    return [(mean, share, count) for mean, share, count, _ in _by_range(probability, right, bins, weights)]
+
+
+def _by_range(
+    probability: Float[np.ndarray, " s"],
+    right: Bool[np.ndarray, " s"],
+    bins: int,
+    weights: Float[np.ndarray, " s"] | None,
+) -> list[tuple[float, float, int, float]]:
+    """Return the rows of `reliability`, and the weight of each."""
     weights = np.ones(len(right)) if weights is None else weights
-
-    def mean(values: Bool[np.ndarray, " s"] | Float[np.ndarray, " s"], own: Bool[np.ndarray, " s"]) -> float:
-        return float(np.average(values[own], weights=weights[own]))
-
-    return [(mean(probability, own), mean(right, own), int(own.sum())) for own in _ranges(probability, bins)]
-
-
-def _ranges(probability: Float[np.ndarray, " s"], bins: int) -> list[Bool[np.ndarray, " s"]]:
-    """Return which poses are in each range of probability that has any."""
     place = np.minimum((probability * bins).astype(int), bins - 1)
-    return [place == row for row in range(bins) if (place == row).any()]
+    rows = []
+    for own in (place == row for row in np.unique(place)):
+        mean, share = (float(np.average(values[own], weights=weights[own])) for values in (probability, right))
+        rows.append((mean, share, int(own.sum()), float(weights[own].sum())))
+    return rows
 
 
 COMPANY = ("own", "best")  # the evidence of `together`, see `company`

@@ -51,7 +51,7 @@ def test_probabilities_hold_for_objects_of_other_kinds() -> None:
 
 def test_probabilities_are_told_as_if_a_share_of_the_searches_was_in_vain() -> None:
     poses = drawn(0, 40)
-    # Of half of the objects the part is never there; how much else is searched in vain is another matter.
+    # Of every second object the part is never there.
     absent = poses["object"] % 2 == 1
     poses["error"] = np.where(absent, np.inf, np.where(np.isinf(poses["error"]), 0.5, poses["error"]))
     seldom, often = (fit(poses, FitOptions(members=1, in_vain=share)) for share in (0.1, 0.5))
