@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, cast
 from zipfile import BadZipFile
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
@@ -22,6 +22,7 @@ from kmn_jax.detection import (
     EVIDENCE,
     PICTURE_EVIDENCE,
     TREE_SETTINGS,
+    VERIFIED,
     Calibration,
     Candidates,
     Clock,
@@ -34,6 +35,7 @@ from kmn_jax.detection import (
     refined_candidates,
     search_at,
     seeds_over,
+    verified,
 )
 from kmn_jax.errors import InputError, shown
 from kmn_jax.files import write_whole
@@ -47,13 +49,14 @@ _COLUMNS = (  # of what is stored
     "largest_error",
     "object",
     "search",
+    "known",  # whether the network, and the verifier, were trained with such parts
     "narrowed",
     "T_camera_object",
     "refined",
-    "due",  # whether they are of what detection chooses among, which refines less; of parts that are not known
+    "due",  # whether they are of what detection chooses among, which refines less
     "reported",
 )
-_HOW = 5  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
+_HOW = 6  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
 _IN_MEMORY = 600  # searches, of each of which what was found first, crops and all, takes 10 MB
 _AT_ONCE = 2  # searches: one alone leaves a part of two cores idle
 
@@ -67,14 +70,12 @@ def poses_to_fit(sources: Sources, fits: FitOptions, network: Model, stored: Pat
     that were chosen by the evidence of before, and evidence that is not used any more is kept. Raises InputError if
     what is stored is of other bins, weights or settings, or lacks evidence that comes of crops.
     """
-    made_of = _made_of(sources, fits, network)
     names: tuple[str, ...] = EVIDENCE
     if stored is None or not stored.exists():
         poses = collect(sources, fits, network, stored and stored.with_name(f"{stored.name}.searches"))
     else:
-        poses = _read(stored, made_of)
-        names, used = (tuple(poses.pop(key).tolist()) for key in ("names", "used"))
-        lacking = sorted(set(EVIDENCE) - {*names, *PICTURE_EVIDENCE})
+        poses, names, used = read_poses(stored, sources, fits, network)
+        lacking = sorted(set(EVIDENCE) - {*names, *PICTURE_EVIDENCE, VERIFIED})
         if lacking:
             raise InputError(
                 f"{stored} lacks {', '.join(lacking)}, which comes of crops: remove it and {stored.name}.searches, to"
@@ -88,17 +89,24 @@ def poses_to_fit(sources: Sources, fits: FitOptions, network: Model, stored: Pat
         poses["evidence"] = np.concatenate([poses["evidence"], kept], axis=1)
         names = (*EVIDENCE, *(names[column] for column in unused))
     if stored is not None:
+        made_of = _made_of(sources, fits, network)
         of = {"made_of": made_of, "names": names, "used": EVIDENCE}  # used: for what is reported
         _write(stored, poses | {key: np.array(value) for key, value in of.items()})
     return told(poses | {"evidence": poses["evidence"][:, : len(EVIDENCE)]})
 
 
-def _read(stored: Path, made_of: str) -> Columns:
-    """Return what is stored. Raises InputError if it is something else."""
+def read_poses(
+    stored: Path, sources: Sources, fits: FitOptions, network: Model
+) -> tuple[Columns, tuple[str, ...], tuple[str, ...]]:
+    """Return what is stored: poses, the names of their evidence, and those by which it was told what is reported.
+
+    Raises InputError if it is of other bins, weights or settings.
+    """
     poses = _loaded(stored)
-    if str(poses.pop("made_of", "")) != made_of or set(poses) != {*_COLUMNS, "names", "used"}:
+    if str(poses.pop("made_of", "")) != _made_of(sources, fits, network) or set(poses) != {*_COLUMNS, "names", "used"}:
         raise InputError(f"{stored} holds poses of other bins, weights or settings: remove it")
-    return poses
+    names, used = (tuple(poses.pop(key).tolist()) for key in ("names", "used"))
+    return poses, names, used
 
 
 def _loaded(path: Path) -> Columns:
@@ -120,10 +128,10 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
 
     First around the seeds that detection begins with, which the model of poses as they are found is fitted to. Then,
     by such models that do not know the image's object, as detection does, round after round: where little is found most
-    is wrong. Of parts that the network knows, no scale is fitted to which, only what was found first is refined. Images
-    are read twice, as they do not all fit into memory. What is in the folder stays as it is, chosen by the models of
-    when it was refined: of images that were built anew make another one. Raises InputError if the folder is of other
-    weights or settings.
+    is wrong. Of parts that the network knows what is found first is all: the verifier learns from it, so that what it
+    says there would tell nothing. Images are read twice, as they do not all fit into memory. What is in the folder
+    stays as it is, chosen by the models of when it was refined: of images that were built anew make another one. Raises
+    InputError if the folder is of other weights or settings.
     """
     config = DetectConfig().search_of(network.config)
     first: dict[int, Candidates] = {}
@@ -135,8 +143,8 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
 
     def found_first(search: Search) -> Columns:
         found = propose(search)(_first_seeds(search))
-        if len(first) < _IN_MEMORY:
-            first[search.row] = _with_poses(found) if search.is_known else found
+        if not search.is_known and len(first) < _IN_MEMORY:
+            first[search.row] = found
         return search.columns(found)
 
     found_parts = _side_by_side(partial(kept.made, "found", found_first), searches(sources, network), at_once)
@@ -147,18 +155,15 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
     searched: dict[int, DevicePart] = {}
 
     def refined(search: Search) -> Columns:
-        found, chooser = first.pop(search.row, None) or propose(search)(_first_seeds(search)), of_all
-        if not search.is_known:
-            chooser = others.get(search.number, of_all)  # of an object without poses no model knows anything
-            found = _explored(search, _going_on(found, propose(search)), chooser)
+        found = first.pop(search.row, None) or propose(search)(_first_seeds(search))
+        chooser = others.get(search.number, of_all)  # of an object without poses no model knows anything
+        found = _explored(search, _going_on(found, propose(search)), chooser)
         choice = chosen(found, chooser, search.on_device, _LOOSE)
         rows = np.flatnonzero(choice.kept | choice.contenders)
         if not len(rows):
             return search.columns(found._replace(usable=np.zeros_like(found.usable))) | {"due": np.zeros(0, dtype=bool)}
         fine = refined_candidates(search.on_device, search.scene, found, rows, 0, config)
-        none = np.zeros(np.count_nonzero(fine.usable), dtype=bool)
-        due = none if search.is_known else _due(found, chooser, search.on_device, rows, fine)
-        return search.columns(fine) | {"due": due}
+        return search.columns(fine) | {"due": _due(found, chooser, search.on_device, rows, fine)}
 
     def refined_part(search: Search) -> Columns:
         found = kept.made("refined", refined, search)
@@ -166,7 +171,8 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
             searched[search.row] = search.on_device
         return found
 
-    more = _joined(_side_by_side(refined_part, searches(sources, network), at_once))
+    unknown = replace(sources, known_worlds=())  # whose searches come last: the others stay in their rows
+    more = _joined(_side_by_side(refined_part, searches(unknown, network), at_once))
     none = np.zeros(len(more["error"]), dtype=bool)
     return _with_reported(_joined([poses, more | {"refined": ~none, "reported": none}]), searched, fits)
 
@@ -187,17 +193,17 @@ class _Kept:
 
     def made(self, stage: str, make: Callable[[Search], Columns], search: Search) -> Columns:
         """Return what a stage makes of a search, or made of it before; nothing of one that is empty."""
-        if self._folder is None:
-            return {} if search.is_empty else make(search)
-        path = self._folder / f"{search.name}-{stage}.npz"
-        if path.exists():
+        path = self._folder and self._folder / f"{search.name}-{stage}.npz"
+        if path and path.exists():
             columns = _loaded(path)
         elif search.is_empty:
             return {}
         else:
             columns = make(search)
-            _write(path, columns)
-        return columns | {"search": np.full(len(columns["error"]), search.row)}  # which may be another one today
+            if path:
+                _write(path, columns)
+        of_search = {"search": search.row, "known": search.is_known}  # the row may be another one today
+        return columns | {name: np.full(len(columns["error"]), value) for name, value in of_search.items()}
 
 
 def _side_by_side(
@@ -234,22 +240,35 @@ def judged_anew(poses: Columns, names: tuple[str, ...], sources: Sources, fits: 
     """
     evidence = np.zeros((len(poses["evidence"]), len(EVIDENCE)), dtype=np.float32)
     for column, name in enumerate(EVIDENCE):
-        if name not in PICTURE_EVIDENCE:
+        if name not in (*PICTURE_EVIDENCE, VERIFIED):
             evidence[:, column] = poses["evidence"][:, names.index(name)]
     of_picture = np.array([EVIDENCE.index(name) for name in PICTURE_EVIDENCE])
     config, searched = DetectConfig().search_of(network.config), {}
+    for search, rows in searches_of(poses, sources, network):
+        searched[search.row] = search.on_device
+        given = search.on_device, search.scene
+        seen = picture_evidence(poses["T_camera_object"][rows], *given, config.agreement)
+        evidence[np.ix_(rows, of_picture)] = seen
+        refined = rows[poses["refined"][rows]]
+        evidence[refined, EVIDENCE.index(VERIFIED)] = verified(poses["T_camera_object"][refined], *given)
+    return _with_reported(poses | {"evidence": evidence}, searched, fits)
+
+
+def searches_of(poses: Columns, sources: Sources, network: Model) -> Iterator[tuple[Search, Int[np.ndarray, " k"]]]:
+    """Yield the searches that stored poses were found in, with the rows of these.
+
+    Raises InputError if the images are not those that the poses were found in.
+    """
+    left = set(poses["search"].tolist())
     for search in searches(sources, network):
         rows = np.flatnonzero(poses["search"] == search.row)
         if len(rows):
-            searched[search.row] = search.on_device
-            found = poses["T_camera_object"][rows]
+            left.remove(search.row)
             _check(bool((poses["object"][rows] == search.number).all()))
-            error = search.errors(found[:1], search.image.errors)
+            error = search.errors(poses["T_camera_object"][rows[:1]], search.image.errors)
             _check(np.allclose(error, poses["error"][rows[:1]], atol=1e-4, equal_nan=True))
-            seen = picture_evidence(found, search.on_device, search.scene, config.agreement)
-            evidence[np.ix_(rows, of_picture)] = seen
-    _check(set(poses["search"].tolist()) == set(searched))
-    return _with_reported(poses | {"evidence": evidence}, searched, fits)
+            yield search, rows
+    _check(not left)
 
 
 def _check(is_same: bool) -> None:
@@ -317,24 +336,9 @@ def _explored(
     return explore(search.scene, search.part, propose, chooser, DetectConfig(), Clock())[0]
 
 
-def _with_poses(found: Candidates) -> Candidates:
-    """Return the candidates of those crops that have any, or of the first: what the network says of crops is large."""
-    crops = np.unique(found.crop[found.usable]) if found.usable.any() else np.arange(1)
-    rows = np.isin(found.crop, crops)
-    return Candidates(
-        found.T_camera_object[rows],
-        found.usable[rows],
-        found.evidence[rows],
-        found.num_inliers[rows],
-        np.searchsorted(crops, found.crop[rows]),
-        jax.tree.map(lambda leaf: np.asarray(leaf)[crops], found.found),
-        found.seed_rows[crops],
-    )
-
-
 def _made_of(sources: Sources, fits: FitOptions, network: Model) -> str:
     """Say what candidates are made of."""
-    folders = [str(folder) for folder in (sources.bins, sources.worlds, sources.known_worlds)]
+    folders = [str(folder) for folder in (sources.bins, sources.worlds, *sources.known_worlds)]
     return repr((_HOW, SEARCHED, sources.method, folders, sources.every, *_settings(fits, network)))
 
 

@@ -38,7 +38,7 @@ class Sources:
     method: Literal["kmn_jax", "FPFH"] = "kmn_jax"
     bins: Path = Path("outputs/validation_bins")  # folder with datasets in BOP format
     worlds: Path | None = None  # folder of world bins to fit on, too: outputs/worlds/validation
-    known_worlds: Path | None = None  # the same, of parts that the network was trained with: no scale is fitted to it
+    known_worlds: tuple[Path, ...] = ()  # the same, of families of parts that the network was trained with
     every: int = 1  # use every so many images of `bins`
     judge_anew: bool = False  # compute what depth images show of stored poses again, as after a change of that code
 
@@ -171,9 +171,11 @@ def _images(sources: Sources, network: Model) -> Iterator[_Image]:
         bins = tqdm(bin_images(folder, SPLIT, network, sources.every), unit="image", desc=folder.name)
         for row, image in enumerate(bins):
             yield _Image(_name(folder), row, 1000 * number + image.key.scene_id, image, _scene_of(image), False)
-    for number, world in enumerate((sources.worlds, sources.known_worlds)):
-        if world is None:
-            continue
+    named = [_name(folder) for folder in (*filter(None, [sources.worlds]), *sources.known_worlds)]
+    if len(set(named)) < len(named):
+        raise InputError(f"worlds are told apart by their folders' names, but these are {', '.join(named)}: rename one")
+    worlds = [(0, sources.worlds)] if sources.worlds else []
+    for number, world in (*worlds, *((1, known) for known in sources.known_worlds)):
         for row, found in enumerate(tqdm(world_images(world, network), unit="image", desc=f"worlds {world.name}")):
             scene = _scene_of_world(found, row)
             yield _Image(_name(world), row, _KINDS * number + found.kind, found, scene, number == 1)

@@ -1,10 +1,11 @@
 """World bins: scenes of many kinds under physics, to fit probabilities on and to test on, as BOP datasets.
 
-Training (of parts that the network was trained with), validation and test differ in random seeds and in the
-families of parts (`experiments.parametric_parts`), the test also in the ranges of containers. Each family of worlds is
-one scene of the dataset, `worlds.json` names them; of each scene's images some show no copy of the part that is asked
-for, but other parts or nothing. `test_targets_bop19.json` says which part is asked for in which image, with the number
-of its copies; other parts have no entries in scene_gt.json.
+Training (of parts that the network was trained with), verifier (of the same families of parts, but others of each),
+validation and test differ in random seeds and in the families of parts (`experiments.parametric_parts`), the test also
+in the ranges of containers. Each family of worlds is one scene of the dataset, `worlds.json` names them; of each
+scene's images some show no copy of the part that is asked for, but other parts or nothing. `test_targets_bop19.json`
+says which part is asked for in which image, with the number of its copies; other parts have no entries in
+scene_gt.json.
 """
 
 from __future__ import annotations
@@ -116,6 +117,8 @@ class Recipe:
 
 # Of parts that the network was trained with (`build_data surfels`): the fit of probabilities wants many kinds.
 TRAINING = Recipe(PARTS_SEED, tuple(TRAINING_FAMILIES), 1.0, sensors=("stereo", "time_of_flight"))
+# The same families of parts by other numbers, for the pose verifier, which needs more scans than parts.
+VERIFIER = Recipe(14, tuple(TRAINING_FAMILIES), 1.0, parts_a_family=4, sensors=TRAINING.sensors)
 VALIDATION = Recipe(11, VALIDATION_FAMILIES, 1.0, parts_a_family=4, images=16)
 TEST = Recipe(12, TEST_FAMILIES, 1.15)
 
@@ -162,10 +165,8 @@ def _write_family(folder: Path, scene_id: int, recipe: Recipe, paths: list[Path]
     family = recipe.families[scene_id - 1]
     rng = np.random.default_rng((recipe.random_seed, scene_id - 1))
 
-    @cache
     def loaded(row: int) -> tuple[ObjectModel, CollisionShape]:
-        model = metric_model(paths[row])
-        return model, collision_shape(model.vertices, model.triangles)
+        return _loaded(paths[row])
 
     frames: list[BopFrame] = []
     targets = []
@@ -186,6 +187,12 @@ def _write_family(folder: Path, scene_id: int, recipe: Recipe, paths: list[Path]
     write_whole(folder / f".targets_{scene_id}.json", json.dumps(targets).encode())
     farthest = max(float(frame.depth.max()) for frame in frames)
     write_scene(folder, SPLIT, scene_id, frames, "m", finest_depth_scale(farthest, "m"))
+
+
+@cache  # a process writes several families of worlds, of the same parts
+def _loaded(path: Path) -> tuple[ObjectModel, CollisionShape]:
+    model = metric_model(path)
+    return model, collision_shape(model.vertices, model.triangles)
 
 
 def _image(

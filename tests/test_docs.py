@@ -26,7 +26,7 @@ def like_the_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_each_table_has_as_many_columns_below_its_head_as_in_it() -> None:
-    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "kmn_jax" / "pretrained").glob("*.md")]
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "kmn_jax" / "pretrained").rglob("*.md")]
     tables = 0
     for page in pages:
         lines = page.read_text(encoding="utf-8").splitlines()

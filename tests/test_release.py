@@ -49,7 +49,7 @@ def test_wheel_and_sdist_are_whole_and_the_wheel_works_in_an_environment_of_its_
         said = archive.read(metadata).decode()
         commands = archive.read(metadata.replace("METADATA", "entry_points.txt")).decode()
     packaged = {name for name in names if "/pretrained/" in name}
-    assert packaged >= {f"kmn_jax/pretrained/{path.name}" for path in (ROOT / "kmn_jax" / "pretrained").glob("*.*")}
+    assert packaged >= {path.relative_to(ROOT).as_posix() for path in (ROOT / "kmn_jax/pretrained").rglob("*.*")}
     assert "kmn_jax/py.typed" in names
     assert {Path(name).name for name in names if "/licenses/" in name} == {"LICENSE", "NOTICE"}
     assert not any(name.startswith(("tests/", "experiments/")) for name in names)

@@ -70,6 +70,7 @@ from kmn_jax.detection._kept_parts import prepare_kept
 from kmn_jax.detection._mapping import call_rows, map_real, map_rows
 from kmn_jax.detection._output import as_json, describe, table, write_bop_csv, write_json
 from kmn_jax.detection._picture_agreement import PictureAgreement, picture_agreement
+from kmn_jax.detection._picture_cells import VERIFIER_SIDE, verifier_cells
 from kmn_jax.detection._result import CropPrediction, Detection, Detections, Pick, Timing, pose_notes, warnings_once
 from kmn_jax.detection._scene import MOST_POINTS, Scene, make_scene
 from kmn_jax.detection._search import (
@@ -89,6 +90,7 @@ from kmn_jax.detection._selection import Selection, select, select_poses
 from kmn_jax.detection._sources import GraspSource, MeshLike, PartSource, ScanSource
 from kmn_jax.detection._surroundings import Surroundings, surroundings
 from kmn_jax.detection._timing import Clock
+from kmn_jax.detection._verification import VERIFIED, verified
 
 __all__ = [
     "COMPANY",
@@ -99,6 +101,8 @@ __all__ = [
     "PICTURE_EVIDENCE",
     "THOROUGH",
     "TREE_SETTINGS",
+    "VERIFIED",
+    "VERIFIER_SIDE",
     "BinMargins",
     "BinPoses",
     "BinPosesConfig",
@@ -208,6 +212,8 @@ __all__ = [
     "surroundings",
     "symmetry_transforms",
     "table",
+    "verified",
+    "verifier_cells",
     "vouched",
     "warnings_once",
     "with_grasps",

@@ -37,6 +37,7 @@ from kmn_jax.detection._search import (
 from kmn_jax.detection._seeds import NUM_SEEDS, seeds_at, seeds_over
 from kmn_jax.detection._selection import Selection, select_poses
 from kmn_jax.detection._timing import Clock
+from kmn_jax.detection._verification import VERIFIED, verified, verify_ahead
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import PaddedCloud
 from kmn_jax.io import object_doubt
@@ -200,12 +201,13 @@ def explore(
 def compile_ahead(
     on_device: DevicePart, cloud: PaddedCloud, image: DepthImage, config: SearchConfig, num_keypoints: int
 ) -> None:
-    """Judge the poses of a crop that has none, refine some pose and polish it: the only use is that all is compiled."""
+    """Judge the poses of a crop that has none, and refine, polish and verify some pose: so all of that is compiled."""
     none = no_poses(config.crops, num_keypoints)
     gather_evidence(none, on_device.arrays, on_device.surfels, image, config.agreement)
     pose, row = jax.device_put((np.eye(4, dtype=np.float32), np.int32(0)))
     refine_one(pose, row, jax.random.key(0), on_device, cloud, image, config.crops.smooth, config.agreement)
     polish_one(pose, on_device, image)
+    verify_ahead(pose, on_device, image)
 
 
 def refined_candidates(
@@ -250,7 +252,8 @@ def refined_candidates(
     def proof(crops: CropPoses) -> Float[jax.Array, "a f"]:
         return gather_evidence(crops, on_device.arrays, on_device.surfels, scene.image, agreement)
 
-    evidence = call_rows(proof, jax.vmap(proof), crops)
+    evidence = np.array(call_rows(proof, jax.vmap(proof), crops))
+    evidence[there, EVIDENCE.index(VERIFIED)] = verified(poses[there], on_device, scene)
     return Candidates(
         _forms_first(poses),
         _forms_first(there),

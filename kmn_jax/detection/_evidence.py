@@ -12,6 +12,7 @@ from kmn_jax.detection._draw import Prediction
 from kmn_jax.detection._mapping import map_real
 from kmn_jax.detection._picture_agreement import PictureAgreement, picture_agreement
 from kmn_jax.detection._surroundings import Surroundings, surroundings
+from kmn_jax.detection._verification import VERIFIED
 from kmn_jax.geometry import inverse, nearest, transform_points
 from kmn_jax.objects import PartArrays
 from kmn_jax.pose import PoseResult
@@ -33,7 +34,7 @@ _OF_CROP = (
     "object_share",  # of the crop's points that are on the object
 )
 PICTURE_EVIDENCE = (*DepthAgreement._fields, *PictureAgreement._fields, *Surroundings._fields)
-EVIDENCE = (*PICTURE_EVIDENCE, *_OF_CROP)
+EVIDENCE = (*PICTURE_EVIDENCE, *_OF_CROP, VERIFIED)
 _NEAR = 0.1  # diameters
 _SURFACE = 0.05  # diameters; points so near to a surface with a normal like it lie on it
 _ALIKE = 0.5  # cosine
@@ -42,7 +43,10 @@ _ALIKE = 0.5  # cosine
 def evidence_on(
     found: CropPoses, part: PartArrays, surfels: Surfels, image: DepthImage, config: DepthAgreementConfig
 ) -> Float[Array, "h f"]:
-    """Return the evidence on each pose of a crop, in the order of EVIDENCE; zeros where there is none."""
+    """Return the evidence on each pose of a crop, in the order of EVIDENCE; zeros where there is none.
+
+    What the verifier says is zero, too: only refined poses are shown to it, see `verified`.
+    """
     prediction = found.prediction
     keypoint_scores = jax.nn.softmax(prediction.logits, axis=1)
 
@@ -84,6 +88,7 @@ def _evidence(
         "covered": _mean(on_object, surface),
         "certainty": _mean(keypoint_scores.max(axis=1), on_object),
         "object_share": _mean(on_object, prediction.mask),
+        VERIFIED: jnp.zeros(()),
     }
     return jnp.stack([columns[name] for name in EVIDENCE])
 

@@ -9,32 +9,25 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from kmn_jax.detection._cells import fit_plane, grown, most, places_of, summed
-from kmn_jax.detection._depth_agreement import DepthImage, depth_at, in_image
-from kmn_jax.geometry import transform_points
+from kmn_jax.detection._depth_agreement import DepthImage
+from kmn_jax.detection._picture_cells import LOOSE, VERIFIER_SIDE, Measured, Predicted, measured, predicted
 from kmn_jax.simulate import Surfels
 from kmn_jax.typing import Pose, Scalar
 
-_CELLS = 32  # of the grid, along the longer side of the picture
-_SPARE = 3  # cells beyond it, on each side
-_SIDE = _CELLS + 2 * _SPARE
-_SAMPLES = ((0.0, 0.0), (-0.3, -0.3), (0.3, -0.3), (-0.3, 0.3), (0.3, 0.3))  # places in a cell, in cells
 # Lengths are in diameters of the object, normals are compared by their cosines.
-_TIGHT, _NEAR, _LOOSE = 0.01, 0.02, 0.04  # between depths
+_TIGHT, _NEAR = 0.01, 0.02  # between depths
 _LEVEL = 0.03  # the same, across the outline, where the surface may bend
-_ONE_SURFACE = 0.06  # between the depths of neighbouring cells, beyond what the slant of the view explains
-_STEEP = 2.5  # cells: that slant
 _ALIKE, _TURNED = 0.85, 0.5
 _PLANE, _PLANE_ALIKE = 0.015, 0.9  # of what lies in one plane
 _REACH = 3  # cells over which a plane is fitted
 _BELOW, _RAISED = 0.02, 0.5  # the plane around an object: so far below it is all below, so high at most counts
 _NO_RELIEF = 1e-3  # diameters: with less, a surface is as good as flat
+_UNSURE = 0.002  # diameters, of depths, whatever the sensor: what odds of a relief are measured by
 _NARROW, _WIDE = 1, 3  # cells: the reach of windows, 3 and 7 cells wide
-_HIGHEST = jax.lax.Precision.HIGHEST
 
 
 class PictureAgreement(NamedTuple):
@@ -64,6 +57,10 @@ class PictureAgreement(NamedTuple):
     relief: Scalar  # where differences in depth are small: how far the object's surface departs from its plane
     relief_alike: Scalar  # its correlation with what is measured, towards 0 where one of them is flat; -1 to 1
     relief_missed: Scalar  # how far the two are apart
+    relief_odds: Scalar  # log odds that this relief was measured, not a plane with noise; log(1 + |.|), with their sign
+    relief_slope: Scalar  # by how much what is measured departs where the object's surface does by 1, ...
+    relief_slope_error: Scalar  # ... and the standard error of that
+    log_pixel: Scalar  # of the width of a pixel on the object, in diameters
     open: Scalar  # something farther away was measured, or nothing, as where the background is cut away
     stepped: Scalar  # something farther away by 1% of the diameter was measured
     level: Scalar  # the measured surface goes on
@@ -78,39 +75,14 @@ class PictureAgreement(NamedTuple):
     buried_deep: Scalar  # buried by more than what surrounds it is uneven; by less than 2% more it counts in part
 
 
-class _Predicted(NamedTuple):
-    """Cells of an object's picture; u and v are directions (u, v, 1) to their centres."""
-
-    mask: Bool[Array, "s s"]
-    depth: Float[Array, "s s"]
-    normals: Float[Array, "s s 3"]
-    u: Float[Array, "s s"]
-    v: Float[Array, "s s"]
-    pitch: Scalar  # of directions
-    nearest: Scalar  # depth of the nearest point
-    surface: Float[Array, "m 3"]  # all of the object's, also what is turned away
-
-
-class _Measured(NamedTuple):
-    """The same cells of a depth image."""
-
-    in_image: Bool[Array, "s s"]
-    there: Bool[Array, "s s"]
-    depth: Float[Array, "s s"]
-    away: Float[Array, "s s"]  # of the sample nearest to the predicted depth from it
-    noise: Float[Array, "s s"]
-    points: Float[Array, "s s 3"]
-    normals: Float[Array, "s s 3"]
-    has_normal: Bool[Array, "s s"]
-
-
 def picture_agreement(T_camera_object: Pose, surfels: Surfels, image: DepthImage, diameter: Scalar) -> PictureAgreement:
     """Compare an object at a pose with a depth image in the same unit, zero where nothing was measured.
 
-    All is zero of a pose that shows nothing to the camera, but `log_area`, which is then the least.
+    All is zero of a pose that shows nothing to the camera, but `log_area`, which is then the least, and
+    `relief_slope_error`, which is 1.
     """
-    seen = _predicted(T_camera_object, surfels, image)
-    found = _measured(seen, image, diameter)
+    seen = predicted(T_camera_object, surfels, image)
+    found = measured(seen, image, diameter)
     mask, there = seen.mask, found.there
     away = found.away / diameter
     gap = jnp.where(there, found.depth - seen.depth, 0) / diameter
@@ -125,10 +97,10 @@ def picture_agreement(T_camera_object: Pose, surfels: Surfels, image: DepthImage
         total = jnp.where(of[..., None], seen.normals, 0).sum(axis=(0, 1))
         return jnp.where(of.any(), 1 - jnp.sqrt((total**2).sum()) / jnp.maximum(of.sum(dtype=jnp.float32), 1), 0)
 
-    tight, near, loose = (mask & there & (away < limit) for limit in (_TIGHT, _NEAR, _LOOSE))
+    tight, near, loose = (mask & there & (away < limit) for limit in (_TIGHT, _NEAR, LOOSE))
     cosine = (seen.normals * found.normals).sum(axis=-1)
     compared = loose & found.has_normal
-    small = loose & (jnp.abs(gap) < _LOOSE)
+    small = loose & (jnp.abs(gap) < LOOSE)
     behind = mask & there & (gap > _TIGHT) & ~tight
     return PictureAgreement(
         tight=share(tight),
@@ -146,6 +118,7 @@ def picture_agreement(T_camera_object: Pose, surfels: Surfels, image: DepthImage
         noise=mean(found.noise, small) / diameter,
         log_cells=jnp.log1p(mask.sum(dtype=jnp.float32)),
         log_area=jnp.log(near.sum(dtype=jnp.float32) * (seen.pitch * seen.nearest / diameter) ** 2 + 1e-4),
+        log_pixel=jnp.where(mask.any(), jnp.log(seen.nearest / (image.camera.fx * diameter)), 0),
         **_relief(seen, found, small, diameter),
         **_outline(seen, found, compared, diameter),
     )
@@ -156,81 +129,8 @@ def _densest(cells: Bool[Array, "s s"], reach: int) -> Scalar:
     return summed(cells.astype(jnp.float32)[..., None], reach).max() / (2 * reach + 1) ** 2
 
 
-def _predicted(T_camera_object: Pose, surfels: Surfels, image: DepthImage) -> _Predicted:
-    points = transform_points(T_camera_object, surfels.points)
-    normals = jnp.matmul(surfels.normals, T_camera_object[:3, :3].T, precision=_HIGHEST)
-    facing = ((points * normals).sum(axis=1) < 0) & (points[:, 2] > 0)
-    some = facing.any()
-    nearest = jnp.where(some, jnp.where(facing, points[:, 2], jnp.inf).min(), 1)
-    z = jnp.where(facing, points[:, 2], nearest)
-    directions = points[:, :2] / z[:, None]
-    low, high = (
-        jnp.where(some, bound(jnp.where(facing[:, None], directions, worst), axis=0), 0)
-        for bound, worst in ((jnp.min, jnp.inf), (jnp.max, -jnp.inf))
-    )
-    # No finer than pixels, nor than surfels are apart, so that there is one in or next to each cell of the surface.
-    spacing = jnp.sqrt(surfels.area / surfels.points.shape[0])
-    finest = jnp.maximum(spacing / nearest, 1 / image.camera.fx)
-    pitch = jnp.maximum((high - low).max() / (_CELLS - 1), finest)
-    place = jnp.round((directions - low[None]) / pitch).astype(jnp.int32) + _SPARE
-    index = place[:, 1] * _SIDE + place[:, 0]
-    front = jnp.full(_SIDE**2, jnp.inf).at[jnp.where(facing, index, _SIDE**2)].min(z, mode="drop")
-    # The surface of a cell is what lies about as near as its nearest point.
-    shown = facing & (z <= front[jnp.clip(index, 0, _SIDE**2 - 1)] + spacing + pitch * nearest)
-    columns = jnp.concatenate([normals, z[:, None], jnp.ones_like(z)[:, None]], axis=1)
-    sums = jnp.zeros((_SIDE**2, 5)).at[jnp.where(shown, index, _SIDE**2)].add(columns, mode="drop")
-    mask = (sums[:, 4] > 0).reshape(_SIDE, _SIDE)
-    length = jnp.sqrt(jnp.maximum((sums[:, :3] ** 2).sum(axis=1, keepdims=True), 1e-12))
-    steps = (jnp.arange(_SIDE, dtype=jnp.float32) - _SPARE) * pitch
-    u, v = jnp.meshgrid(low[0] + steps, low[1] + steps)
-    depth = (sums[:, 3] / jnp.maximum(sums[:, 4], 1)).reshape(_SIDE, _SIDE)
-    return _Predicted(mask, depth, (sums[:, :3] / length).reshape(_SIDE, _SIDE, 3), u, v, pitch, nearest, points)
-
-
-def _measured(seen: _Predicted, image: DepthImage, diameter: Scalar) -> _Measured:
-    samples = jnp.stack([depth_at(image, seen.u + du * seen.pitch, seen.v + dv * seen.pitch) for du, dv in _SAMPLES])
-    real = samples > 0
-    there = real.any(axis=0)
-    anchor = jnp.where(real[0], samples[0], samples[1:].max(axis=0))
-    own = real & (jnp.abs(samples - anchor[None]) < _LOOSE * diameter)
-    count = jnp.maximum(own.sum(axis=0, dtype=jnp.float32), 1)
-    depth = jnp.where(own, samples, 0).sum(axis=0) / count
-    noise = jnp.sqrt(jnp.where(own, (samples - depth[None]) ** 2, 0).sum(axis=0) / jnp.maximum(count - 1, 1))
-    away = jnp.where(real, jnp.abs(samples - seen.depth[None]), jnp.inf).min(axis=0)
-    points = jnp.stack([seen.u, seen.v, jnp.ones_like(seen.u)], axis=-1) * depth[..., None]
-    reach = _ONE_SURFACE * diameter + _STEEP * seen.pitch * seen.nearest
-    (along_u, has_u), (along_v, has_v) = (_slope(points, there, axis, reach) for axis in (1, 0))
-    normals = jnp.cross(along_v, along_u)
-    length = jnp.sqrt(jnp.maximum((normals**2).sum(axis=-1, keepdims=True), 1e-24))
-    normals = normals / length
-    normals = jnp.where((normals * points).sum(axis=-1, keepdims=True) > 0, -normals, normals)
-    return _Measured(
-        in_image(image, seen.u, seen.v),
-        there,
-        depth,
-        away,
-        noise,
-        points,
-        normals,
-        has_u & has_v & (length[..., 0] > 1e-12),
-    )
-
-
-def _slope(
-    points: Float[Array, "s s 3"], there: Bool[Array, "s s"], axis: int, reach: Scalar
-) -> tuple[Float[Array, "s s 3"], Bool[Array, "s s"]]:
-    """Return the way from cell to cell along an axis, where both are on one surface."""
-    ways, known = [], []
-    for step in (-1, 1):
-        way = step * (points - jnp.roll(points, step, axis))
-        same = there & jnp.roll(there, step, axis) & (jnp.abs(way[..., 2]) < reach)
-        ways.append(jnp.where(same[..., None], way, 0))
-        known.append(same)
-    return ways[0] + ways[1], known[0] | known[1]
-
-
 def _beside_outline(
-    seen: _Predicted, found: _Measured, around: Bool[Array, "s s"], diameter: Scalar
+    seen: Predicted, found: Measured, around: Bool[Array, "s s"], diameter: Scalar
 ) -> dict[str, Scalar]:
     """Return how an object's whole surface lies to the plane of what is measured around it; in it if nothing is.
 
@@ -256,7 +156,7 @@ def _beside_outline(
     }
 
 
-def _relief(seen: _Predicted, found: _Measured, of: Bool[Array, "s s"], diameter: Scalar) -> dict[str, Scalar]:
+def _relief(seen: Predicted, found: Measured, of: Bool[Array, "s s"], diameter: Scalar) -> dict[str, Scalar]:
     """Return how an object's surface departs from its plane in some cells, and whether what is measured does."""
 
     def departing(depth: Float[Array, "s s"]) -> Float[Array, "s s"]:
@@ -264,18 +164,24 @@ def _relief(seen: _Predicted, found: _Measured, of: Bool[Array, "s s"], diameter
         return jnp.where(of, depth - plane.depth(*places_of(depth)), 0) / diameter
 
     def mean(values: Float[Array, "s s"]) -> Scalar:
-        return values.sum() / jnp.maximum(of.sum(dtype=jnp.float32), 1)
+        return values.sum() / count
 
-    own, measured = departing(seen.depth), departing(found.depth)
-    sizes = [jnp.sqrt(jnp.maximum(mean(away**2), _NO_RELIEF**2)) for away in (own, measured)]
+    count = jnp.maximum(of.sum(dtype=jnp.float32), 1)
+    own, other = departing(seen.depth), departing(found.depth)
+    of_own, of_other, both, missed = (mean(of) for of in (own**2, other**2, own * other, (own - other) ** 2))
+    sizes = [jnp.sqrt(jnp.maximum(square, _NO_RELIEF**2)) for square in (of_own, of_other)]
+    odds = count / 2 * jnp.log((of_other + _UNSURE**2) / (missed + _UNSURE**2))
     return {
-        "relief": jnp.sqrt(mean(own**2)),
-        "relief_alike": mean(own * measured) / (sizes[0] * sizes[1]),
-        "relief_missed": jnp.sqrt(mean((own - measured) ** 2)),
+        "relief": jnp.sqrt(of_own),
+        "relief_alike": both / (sizes[0] * sizes[1]),
+        "relief_missed": jnp.sqrt(missed),
+        "relief_odds": jnp.sign(odds) * jnp.log1p(jnp.abs(odds)),
+        "relief_slope": both / (of_own + (3 * _NO_RELIEF) ** 2),
+        "relief_slope_error": jnp.sqrt((missed + _NO_RELIEF**2) / (of_own + _NO_RELIEF**2) / count),
     }
 
 
-def _outline(seen: _Predicted, found: _Measured, compared: Bool[Array, "s s"], diameter: Scalar) -> dict[str, Scalar]:
+def _outline(seen: Predicted, found: Measured, compared: Bool[Array, "s s"], diameter: Scalar) -> dict[str, Scalar]:
     """Return how the measured surface goes on beyond the outline, and how the object's lies to it."""
     edge = grown(seen.mask)
     outline = grown(edge) & ~edge & found.in_image
@@ -290,7 +196,7 @@ def _outline(seen: _Predicted, found: _Measured, compared: Bool[Array, "s s"], d
     # The plane of what is measured on the object near by.
     count, normal, center = (
         summed(jnp.where(compared[..., None], values, 0), _REACH)
-        for values in (jnp.ones((_SIDE, _SIDE, 1)), found.normals, found.points)
+        for values in (jnp.ones((VERIFIER_SIDE, VERIFIER_SIDE, 1)), found.normals, found.points)
     )
     normal = normal / jnp.sqrt(jnp.maximum((normal**2).sum(axis=-1, keepdims=True), 1e-24))
     height = ((found.points - center / jnp.maximum(count, 1)) * normal).sum(axis=-1) / diameter

@@ -17,6 +17,16 @@ from kmn_jax.models._layers import Compute
 from kmn_jax.models._losses import LossConfig, MatchingLoss, keypoint_labels, matching_loss
 from kmn_jax.models._normalization import released_object, released_scene
 from kmn_jax.models._released import RELEASED_CONFIG, load_released, save_released
+from kmn_jax.models._verifier import (
+    VERIFIER,
+    VERIFIER_CHANNELS,
+    PoseVerifier,
+    Verifier,
+    create_verifier,
+    load_verifier,
+    save_verifier,
+    verify,
+)
 from kmn_jax.models._weights import PRETRAINED, is_model_file, load_model, load_pretrained, released_file, save_model
 
 __all__ = [
@@ -26,6 +36,8 @@ __all__ = [
     "PRETRAINED",
     "RELEASED_CONFIG",
     "SCENE_CHANNELS",
+    "VERIFIER",
+    "VERIFIER_CHANNELS",
     "Compute",
     "KeyMatchNet",
     "KeyMatchNetConfig",
@@ -33,7 +45,10 @@ __all__ = [
     "MatchingLoss",
     "Model",
     "ObjectFeatures",
+    "PoseVerifier",
+    "Verifier",
     "create_model",
+    "create_verifier",
     "encode_object",
     "encode_scene",
     "is_model_file",
@@ -41,6 +56,7 @@ __all__ = [
     "load_model",
     "load_pretrained",
     "load_released",
+    "load_verifier",
     "match",
     "matching_loss",
     "model_structure",
@@ -49,5 +65,7 @@ __all__ = [
     "released_scene",
     "save_model",
     "save_released",
+    "save_verifier",
+    "verify",
     "with_chiral_inputs",
 ]

@@ -24,11 +24,16 @@ _CONFIG_KEY = "kmn_jax.config"
 
 def save_model(model: tuple[nnx.GraphDef, nnx.State], path: str | Path) -> None:
     """Write parameters and config to a .safetensors file."""
-    tensors = {
-        ".".join(map(str, path)): np.ascontiguousarray(value[...]) for path, value in nnx.to_flat_state(model[1])
-    }
     config = json.dumps(dataclasses.asdict(Model(*model).config))
-    write_whole(path, safetensors_bytes(tensors, {_CONFIG_KEY: config}))
+    write_whole(path, parameters_bytes(model[1], {_CONFIG_KEY: config}))
+
+
+def parameters_bytes(parameters: nnx.State, metadata: dict[str, str]) -> bytes:
+    """Return the content of a .safetensors file of parameters."""
+    tensors = {
+        ".".join(map(str, path)): np.ascontiguousarray(value[...]) for path, value in nnx.to_flat_state(parameters)
+    }
+    return safetensors_bytes(tensors, metadata)
 
 
 def is_model_file(path: str | Path) -> bool:
@@ -71,7 +76,15 @@ def load_model(path: str | Path) -> Model:
     except (TypeError, ValueError) as error:
         raise InputError(f"{path} has a config that this version of kmn_jax cannot use: {shown(error)}") from None
     graphdef, parameters = model_structure(config)
-    flat = dict(nnx.to_flat_state(parameters))
+    return Model(graphdef, parameters_of(path, tensors, parameters))
+
+
+def parameters_of(path: str | Path, tensors: dict[str, np.ndarray], shapes: nnx.State) -> nnx.State:
+    """Return the tensors of a file as the parameters of a network, given with `shapes` in their place.
+
+    Raises InputError for missing, unknown or misshapen ones, and for values that are not finite.
+    """
+    flat = dict(nnx.to_flat_state(shapes))
     wanted = {".".join(map(str, target)): target for target in flat}
     problems = [f"{name} is missing" for name in wanted if name not in tensors]
     problems += [f"{shown(name)} is unknown" for name in tensors if name not in wanted]
@@ -86,11 +99,8 @@ def load_model(path: str | Path) -> Model:
         if name in tensors and not _are_finite(tensors[name])
     ]
     if problems:
-        raise InputError(f"{path} does not fit its own config: {'; '.join(problems[:8])}")
-    return Model(
-        graphdef,
-        nnx.from_flat_state({t: flat[t].replace(jax.device_put(tensors[name])) for name, t in wanted.items()}),
-    )
+        raise InputError(f"{path} does not fit the network: {'; '.join(problems[:8])}")
+    return nnx.from_flat_state({t: flat[t].replace(jax.device_put(tensors[name])) for name, t in wanted.items()})
 
 
 def _are_finite(values: np.ndarray) -> bool:

@@ -16,6 +16,7 @@ from tests.reference.meshes import pose
 PART = box_part()
 SURFELS = Surfels(jnp.asarray(PART.points), jnp.asarray(PART.normals), jnp.float32(PART.area))
 NO_SHARES = ("offset", "log_cells", "log_area", "deviation", "noise", "raised", "relief_alike")
+NO_SHARES += ("relief_odds", "relief_slope", "relief_slope_error", "log_pixel")
 compare = jax.jit(picture_agreement)
 
 
@@ -137,6 +138,8 @@ def test_a_pose_behind_the_sensor_or_outside_of_the_image_has_no_outline(depth: 
     for T in (pose((0.0, 0.0, -3.0)), pose((9.0, 0.0, 3.0))):
         found = of(T, depth)
         assert (found.open, found.level, found.near) == (0, 0, 0)
+        assert (found.relief_odds, found.relief_slope, found.relief_slope_error) == (0, 0, 1)
+    assert of(pose((0.0, 0.0, -3.0)), depth).log_pixel == 0
     tiny = of(pose((0.0, 0.0, 200.0)), jnp.full_like(depth, 300.0))  # the box is less than a pixel large
     assert (tiny.open, tiny.level) == (1, 0)
 
@@ -262,6 +265,31 @@ def test_relief_that_is_measured_and_relief_that_is_not(depth: jax.Array) -> Non
     assert neither.relief_missed < 0.02 * both.relief
     tilted = compare(T, flat, DepthImage(wall + 0.03 * x, camera), diameter)
     assert tilted.relief_missed < 0.05 * both.relief
+    # Half of a plate's cells, times the log of how much farther the plane is off, of what is never sure to 0.2%.
+    cells = float(jnp.expm1(both.log_cells))
+    for found, sure in ((both, 1), (missing, -1)):
+        square = float(both.relief) ** 2 / 0.002**2
+        odds = np.log1p(cells / 2 * np.log1p(square))
+        assert found.relief_odds == pytest.approx(sure * odds, rel=0.1)
+        assert found.relief_slope == pytest.approx((1 + sure) / 2, abs=0.2)
+        assert 0 < found.relief_slope_error < 0.05
+    assert abs(neither.relief_odds) < 1
+    assert both.log_pixel == pytest.approx(np.log(3.0 / CAMERA.fx / 2**0.5), abs=0.01)
+
+
+def test_noise_hides_relief_from_its_correlation_sooner_than_from_its_odds(depth: jax.Array) -> None:
+    camera, diameter, T = intrinsics(CAMERA), jnp.float32(2**0.5), jnp.asarray(pose((0.0, 0.0, 3.0)), jnp.float32)
+    flat = plate()
+    ridge = flat._replace(points=flat.points.at[:, 2].set(0.1 * jnp.abs(flat.points[:, 0])))
+    x = (jnp.arange(CAMERA.width, dtype=jnp.float32)[None] - CAMERA.cx) / CAMERA.fx * 3
+    noise = jnp.asarray(np.random.default_rng(0).normal(0, 0.03, depth.shape), jnp.float32)
+    bent, even = (compare(T, ridge, DepthImage(3.0 + way * jnp.abs(x) + noise, camera), diameter) for way in (0.1, 0.0))
+    assert bent.relief_alike < 0.8
+    assert bent.relief_odds > 3
+    assert even.relief_odds < -3
+    # Where a relief may as well be noise, its slope is called less.
+    assert 0.7 < bent.relief_slope < 1
+    assert abs(even.relief_slope) < 4 * even.relief_slope_error
 
 
 def test_the_background_is_no_relief_nor_is_the_slant_of_a_plate(depth: jax.Array) -> None:

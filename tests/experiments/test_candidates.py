@@ -19,6 +19,7 @@ from experiments.searches import Sources
 from kmn_jax.detection import (
     EVIDENCE,
     PICTURE_EVIDENCE,
+    VERIFIED,
     Calibration,
     Candidates,
     DetectConfig,
@@ -53,6 +54,9 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
         assert agreement == DetectConfig().search.agreement
         return poses[:, :1, 3] + 10 * scene + 100 * np.arange(len(PICTURE_EVIDENCE))
 
+    def shown_to_verifier(poses: np.ndarray, part: int, scene: int) -> np.ndarray:
+        return -poses[:, 0, 3] - 10 * scene
+
     def models(poses: dict[str, np.ndarray], fits: FitOptions) -> Any:
         assert poses["refined"].all()
         return [(np.unique(poses["object"]), int((poses["error"] < 0.1).sum()))]
@@ -64,6 +68,7 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(module, "searches", searches)
     monkeypatch.setattr(module, "picture_evidence", shown)
+    monkeypatch.setattr(module, "verified", shown_to_verifier)
     monkeypatch.setattr(module, "held_out_models", models)
     monkeypatch.setattr(module, "chosen", all_but_the_first)
 
@@ -86,6 +91,7 @@ def store(path: Path, network: Model, names: tuple[str, ...] = EVIDENCE, **other
         "largest_error": np.array([0.01, 0.2, 0.2, 0.2, 0.01, 0.01]),
         "object": np.array([7, 7, 7, 7, 8, 8]),
         "search": np.array([0, 0, 0, 0, 1, 1]),
+        "known": np.zeros(6, dtype=bool),
         "narrowed": np.zeros(6, dtype=bool),
         "T_camera_object": poses,
         "refined": np.array([False, True, True, True, True, True]),
@@ -95,7 +101,7 @@ def store(path: Path, network: Model, names: tuple[str, ...] = EVIDENCE, **other
     np.savez(path, **stored | others)
 
 
-_OF_CROPS = tuple(name for name in EVIDENCE if name not in PICTURE_EVIDENCE)
+_OF_CROPS = tuple(name for name in EVIDENCE if name not in (*PICTURE_EVIDENCE, VERIFIED))
 
 
 @pytest.mark.usefixtures("searched")
@@ -110,6 +116,8 @@ def test_stored_poses_are_judged_anew_by_other_evidence(
         column = poses["evidence"][:, EVIDENCE.index(name)]
         if name in PICTURE_EVIDENCE:
             wanted = np.array([0, 1, 2, 3, 14, 15]) + 100 * PICTURE_EVIDENCE.index(name)
+        elif name == VERIFIED:  # which sees refined poses alone
+            wanted = np.array([0, -1, -2, -3, -14, -15])
         else:
             wanted = np.full(6, names.index(name))
         np.testing.assert_array_equal(column, wanted)
@@ -139,9 +147,9 @@ def test_stored_poses_are_judged_anew_if_that_is_asked_for(tmp_path: Path, netwo
 @pytest.mark.usefixtures("searched")
 def test_stored_poses_that_cannot_be_judged_anew_stay(tmp_path: Path, network: Model) -> None:
     path, anew = tmp_path / "poses.npz", Sources(judge_anew=True)
-    store(path, network, EVIDENCE[:-1])
+    store(path, network, tuple(name for name in EVIDENCE if name != _OF_CROPS[-1]))
     before = path.read_bytes()
-    with pytest.raises(InputError, match=f"lacks {EVIDENCE[-1]}, which comes of crops"):
+    with pytest.raises(InputError, match=f"lacks {_OF_CROPS[-1]}, which comes of crops"):
         poses_to_fit(Sources(), FitOptions(), network, path)
     assert path.read_bytes() == before
     other_images = {"error": np.array([0.01, 0.01, 0.01, 0.01, 0.3, 0.01])}

@@ -21,27 +21,12 @@ from kmn_jax.errors import InputError
 from kmn_jax.models import Model, create_model
 from tests.reference.networks import TINY
 
+SOURCES = Sources(known_worlds=(Path("known"),))
+
 
 @pytest.fixture(scope="module")
 def network() -> Model:
     return create_model(TINY, jax.random.key(0))
-
-
-def test_crops_without_poses_are_dropped_and_the_others_keep_theirs() -> None:
-    usable = np.array([False, False, True, False, False, False, False, True])  # two poses of each of four crops
-    crop = np.repeat(np.arange(4), 2)
-    said: Any = {"logits": np.arange(4)}
-    found = Candidates(
-        np.arange(8)[:, None], usable, np.arange(8)[:, None] * 10, np.arange(8), crop, said, crop[::2] * 7
-    )
-    few = module._with_poses(found)
-    np.testing.assert_array_equal(few.evidence[:, 0], [20, 30, 60, 70])
-    np.testing.assert_array_equal(few.usable, [True, False, False, True])
-    np.testing.assert_array_equal(few.crop, [0, 0, 1, 1])
-    np.testing.assert_array_equal(few.found["logits"], [1, 3])
-    np.testing.assert_array_equal(few.seed_rows, [7, 21])
-    none = module._with_poses(found._replace(usable=np.zeros(8, dtype=bool)))
-    assert (len(none.usable), len(none.seed_rows)) == (2, 1)
 
 
 def test_what_detection_refines_is_told_of_all_forms(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -78,7 +63,6 @@ class Asked:
         monkeypatch.setattr(module, "_first_seeds", lambda search: None)
         monkeypatch.setattr(module, "_propose", lambda search, *given: partial(self.propose, search.scene))
         monkeypatch.setattr(module, "_explored", lambda search, propose, model: self.found(2, 10.0 + model))
-        monkeypatch.setattr(module, "_with_poses", lambda found: found)
         monkeypatch.setattr(module, "_models", lambda poses, fits: models[bool(poses["refined"].all())])
         monkeypatch.setattr(module, "model_of", lambda poses, fits: 5)
         monkeypatch.setattr(module, "chosen", self.all_of)
@@ -86,6 +70,8 @@ class Asked:
 
     def searches(self, sources: Sources, network: Any) -> Any:
         for row, own in enumerate(self.order):
+            if own == 2 and not sources.known_worlds:
+                continue
 
             def columns(found: Any, row: int = row, own: int = own) -> dict[str, np.ndarray]:
                 count = int(found.usable.sum())
@@ -112,23 +98,24 @@ class Asked:
         return SimpleNamespace(kept=np.ones(count, dtype=bool), contenders=np.zeros(count, dtype=bool))
 
 
-def test_unknown_parts_are_searched_as_detection_does_and_known_ones_at_first_seeds(
+def test_unknown_parts_are_searched_as_detection_does_and_known_ones_at_first_seeds_alone(
     monkeypatch: pytest.MonkeyPatch, network: Model
 ) -> None:
-    """A search of an unknown part is explored with the model that does not know it, one of a known part is not."""
+    """A search of an unknown part is explored with the model that does not know it, one of a known part has ended."""
     asked = Asked(monkeypatch)
-    result = module.collect(Sources(), FitOptions(), network)
+    result = module.collect(SOURCES, FitOptions(), network)
     refined = result["refined"]
     np.testing.assert_array_equal(result["search"][~refined], [0, 1, 2])
-    np.testing.assert_array_equal(result["search"][refined], [0, 0, 1, 1, 2])
-    np.testing.assert_array_equal(result["evidence"][refined, 0], [11, 11, 15, 15, 0])
-    np.testing.assert_array_equal(result["due"][refined], [True, True, True, True, False])
+    np.testing.assert_array_equal(result["search"][refined], [0, 0, 1, 1])
+    np.testing.assert_array_equal(result["known"], result["search"] == 2)
+    np.testing.assert_array_equal(result["evidence"][refined, 0], [11, 11, 15, 15])
+    assert result["due"][refined].all()
     np.testing.assert_array_equal(result["reported"], result["due"])
-    assert sorted(asked.chosen_by[:5]) == [(0, 1), (0, 1), (1, 5), (1, 5), (2, 5)]
+    assert sorted(asked.chosen_by[:4]) == [(0, 1), (0, 1), (1, 5), (1, 5)]
     assert sorted(asked.proposed) == [0, 1, 2]  # what was found first is kept in memory, ...
     monkeypatch.setattr(module, "_IN_MEMORY", 0)  # ... or found again
-    again = module.collect(Sources(), FitOptions(), network)
-    assert sorted(asked.proposed[3:]) == [0, 0, 1, 1, 2, 2]
+    again = module.collect(SOURCES, FitOptions(), network)
+    assert sorted(asked.proposed[3:]) == [0, 0, 1, 1, 2]
     for name, values in result.items():
         np.testing.assert_array_equal(again[name], values)
 
@@ -138,23 +125,23 @@ def test_what_was_searched_before_an_end_is_not_searched_again(
 ) -> None:
     asked, folder = Asked(monkeypatch), tmp_path / "searches"
     asked.order = [0, 2]
-    before = module.collect(Sources(), FitOptions(), network, folder)
+    before = module.collect(SOURCES, FitOptions(), network, folder)
     assert sorted(asked.proposed) == [0, 2]
-    (folder / "c-refined.npz").unlink()
+    (folder / "a-refined.npz").unlink()
     asked.order = [1, 0, 3, 2]  # others may come between, and an empty one
-    after = module.collect(Sources(), FitOptions(), network, folder)
-    assert sorted(asked.proposed[2:]) == [1, 2]
+    after = module.collect(SOURCES, FitOptions(), network, folder)
+    assert sorted(asked.proposed[2:]) == [0, 1]
     for name, values in before.items():
         if name != "search":
             np.testing.assert_array_equal(after[name][after["search"] != 0], values)
-    np.testing.assert_array_equal(after["search"], [0, 1, 3, 0, 0, 1, 1, 3])
+    np.testing.assert_array_equal(after["search"], [0, 1, 3, 0, 0, 1, 1])
     count = len(asked.chosen_by)
-    module.collect(Sources(), FitOptions(), network, folder)
+    module.collect(SOURCES, FitOptions(), network, folder)
     assert len(asked.proposed) == 4
     assert sorted(asked.chosen_by[count:]) == [(0, 1), (1, 2)]  # for what is reported alone
     (folder / "b-found.npz").write_bytes(b"no numbers")
     with pytest.raises(InputError, match=r"b-found.npz holds no poses .*: remove it"):
-        module.collect(Sources(), FitOptions(), network, folder)
+        module.collect(SOURCES, FitOptions(), network, folder)
     with pytest.raises(InputError, match="holds searches by other weights or settings, or other evidence: remove it"):
         module.collect(Sources(method="FPFH"), FitOptions(), network, folder)
 
@@ -201,7 +188,7 @@ def test_bins_of_which_nothing_can_be_searched_are_refused(monkeypatch: pytest.M
     asked = Asked(monkeypatch)
     asked.order = [3]
     with pytest.raises(InputError, match="nothing of the bins can be searched"):
-        module.collect(Sources(), FitOptions(), network)
+        module.collect(SOURCES, FitOptions(), network)
 
 
 def test_a_search_that_finds_nothing_is_kept_as_well(
@@ -216,8 +203,8 @@ def test_a_search_that_finds_nothing_is_kept_as_well(
 
     monkeypatch.setattr(module, "chosen", all_but_one)
     for _ in range(2):
-        result = module.collect(Sources(), FitOptions(), network, tmp_path / "searches")
-        np.testing.assert_array_equal(result["search"][result["refined"]], [1, 1, 2])
+        result = module.collect(SOURCES, FitOptions(), network, tmp_path / "searches")
+        np.testing.assert_array_equal(result["search"][result["refined"]], [1, 1])
     assert sorted(asked.proposed) == [0, 1, 2]
 
 

@@ -1,0 +1,226 @@
+"""Train the pose verifier: `python -m experiments.train_verifier --candidates outputs/poses.npz --every 4 ...`.
+
+It learns which poses are right from those that `python -m experiments.calibrate --candidates FILE` has found in known
+worlds; name FILE, images and worlds as there. How it does on the refined poses of all other images, to which
+probabilities are fitted, is told, and nothing is chosen by it. Afterwards raise the number of
+`kmn_jax.detection.VERIFIED`, and fit again by the same FILE, whose poses are judged anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import tyro
+from flax import nnx
+from jaxtyping import Array, Bool, Float, Float16, Int
+from tqdm import tqdm
+
+from experiments.bins import THRESHOLD
+from experiments.candidates import read_poses, searches_of
+from experiments.fits import FitOptions, told
+from experiments.searches import Columns, Sources
+from kmn_jax.detection import VERIFIER_SIDE, call_rows, verifier_cells
+from kmn_jax.errors import InputError, require
+from kmn_jax.files import write_whole
+from kmn_jax.models import (
+    VERIFIER,
+    VERIFIER_CHANNELS,
+    Model,
+    Verifier,
+    create_verifier,
+    load_pretrained,
+    save_verifier,
+    verify,
+)
+from kmn_jax.programs import call_in_place
+from kmn_jax.report import check_target, environment, markdown_table, print_table, write_json
+from kmn_jax.train import OptimizerConfig
+from kmn_jax.typing import PRNGKey, Scalar
+
+_AT_ONCE = 256  # poses that are verified
+_LEAST_RATE = 1e-6
+_EXACT = 0.95  # share of right poses, for which recall is told
+
+
+@dataclass(frozen=True)
+class Options(FitOptions, Sources):
+    """What it is trained on, how, and where it goes."""
+
+    candidates: Path = Path("outputs/poses.npz")
+    output: Path = VERIFIER  # and a card beside it
+    epochs: int = 8
+    batch: int = 64
+    learning_rate: float = 3e-3  # the highest, after a quarter of the steps
+    weight_decay: float = 1e-2
+    random_seed: int = 0
+    json: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse values that contradict their meaning."""
+        super().__post_init__()
+        require(min(self.epochs, self.batch) > 0, "epochs and batch must be at least 1")
+
+
+class State(NamedTuple):
+    """All that changes from step to step."""
+
+    parameters: nnx.State
+    optimizer: optax.OptState
+    step: Int[Array, ""]
+
+
+def train_verifier(options: Options) -> dict[str, Any]:
+    """Train, write and print. Raises InputError if there is nothing to learn from."""
+    for target in (options.output, options.json):
+        check_target(target)
+    network = load_pretrained()
+    poses = told(read_poses(options.candidates, options, options, network)[0])
+    require(bool(poses["known"].any()), f"{options.candidates} holds no poses of known worlds: see --known-worlds")
+    wanted = poses["known"] | poses["due"]
+    poses = {name: values[wanted] for name, values in poses.items()}
+    cells = _cells_of(poses, options, network)
+    known = poses["known"]
+    right = (poses["error"] < THRESHOLD).astype(np.float32)
+    _, kind, counts = np.unique(poses["object"][known], return_inverse=True, return_counts=True)
+    weights = 1 / np.sqrt(counts[kind])
+    verifier = fitted(cells[known], right[known], (weights / weights.mean()).astype(np.float32), options)
+    save_verifier(verifier, options.output)
+    log_odds = log_odds_of(verifier, cells)
+    splits = {"known parts": known, "other parts": ~known}
+    rows = [{"poses of": name} | _judged(log_odds[own], right[own]) for name, own in splits.items() if own.any()]
+    print_table("The verifier alone", rows)
+    _write_card(options, rows)
+    results = {"verifier": rows}
+    write_json(options.json, results)
+    return results
+
+
+def _cells_of(poses: Columns, options: Options, network: Model) -> Float16[np.ndarray, "p s s c"]:
+    """Return what a verifier sees of each pose."""
+    cells = np.empty((len(poses["error"]), VERIFIER_SIDE, VERIFIER_SIDE, VERIFIER_CHANNELS), dtype=np.float16)
+    for search, rows in searches_of(poses, options, network):
+        given = search.on_device.surfels, search.scene.image, search.on_device.arrays.diameter
+        cells[rows] = call_rows(
+            lambda pose, given=given: _cells(pose, *given),
+            lambda poses, given=given: _cells_of_many(poses, *given),
+            poses["T_camera_object"][rows],
+        )
+    return cells
+
+
+_cells = jax.jit(verifier_cells)
+_cells_of_many = jax.jit(jax.vmap(verifier_cells, in_axes=(0, None, None, None)))
+
+
+def fitted(
+    cells: Float16[np.ndarray, "p s s c"],
+    right: Float[np.ndarray, " p"],
+    weights: Float[np.ndarray, " p"],
+    options: Options,
+) -> Verifier:
+    """Return a verifier that is trained with poses, of which each counts as much as its weight."""
+    require(len(cells) >= options.batch, f"{len(cells)} poses are less than a batch of {options.batch}")
+    key = jax.random.key(options.random_seed)
+    graphdef, parameters = create_verifier(key)
+    steps = options.epochs * (len(cells) // options.batch)
+    optimizer = OptimizerConfig(
+        "adamw", "cosine", options.learning_rate, _LEAST_RATE, steps // 4, weight_decay=options.weight_decay
+    ).build(steps)
+    state = State(parameters, optimizer.init(parameters), jnp.int32(0))
+    for rows in tqdm(_batches(len(cells), options), total=steps, desc="verifier", unit="step"):
+        batch = jax.device_put((cells[rows].astype(np.float32), right[rows], weights[rows]))
+        state = _train_step(graphdef, optimizer, state, *batch, key)
+    return Verifier(graphdef, state.parameters)
+
+
+def _batches(count: int, options: Options) -> Iterator[Int[np.ndarray, " b"]]:
+    """Yield the rows of batches: in each epoch all, in another order, but for what fills no batch."""
+    rng = np.random.default_rng(options.random_seed)
+    for _ in range(options.epochs):
+        order = rng.permutation(count)
+        yield from order[: count - count % options.batch].reshape(-1, options.batch)
+
+
+@partial(jax.jit, static_argnames=("graphdef", "optimizer"))
+def _train_step(
+    graphdef: nnx.GraphDef,
+    optimizer: optax.GradientTransformation,
+    state: State,
+    cells: Float[Array, "b s s c"],
+    right: Float[Array, " b"],
+    weights: Float[Array, " b"],
+    key: PRNGKey,
+) -> State:
+    """Return the state after one more step; `key` is that of the run."""
+    turns, drops = jax.random.split(jax.random.fold_in(key, state.step))
+    cells = jax.vmap(_turned)(cells, jax.random.bernoulli(turns, shape=(len(cells), 3)))
+    keys = jax.random.split(drops, len(cells))
+
+    def loss(parameters: nnx.State) -> Scalar:
+        log_odds = jax.vmap(verify, in_axes=(None, None, 0, 0))(graphdef, parameters, cells, keys)
+        return (weights * optax.sigmoid_binary_cross_entropy(log_odds, right)).mean()
+
+    change, optimizer_state = optimizer.update(jax.grad(loss)(state.parameters), state.optimizer, state.parameters)
+    return State(optax.apply_updates(state.parameters, change), optimizer_state, state.step + 1)
+
+
+def _turned(cells: Float[Array, "s s c"], which: Bool[Array, "3"]) -> Float[Array, "s s c"]:
+    """Return a picture, or its mirror image along one or both of its axes, or that with rows for columns."""
+    cells = jnp.where(which[0], cells[::-1], cells)
+    cells = jnp.where(which[1], cells[:, ::-1], cells)
+    return jnp.where(which[2], jnp.swapaxes(cells, 0, 1), cells)
+
+
+def log_odds_of(verifier: Verifier, cells: Float16[np.ndarray, "p s s c"]) -> Float[np.ndarray, " p"]:
+    """Return what a verifier says of poses."""
+    parts = (cells[first : first + _AT_ONCE].astype(np.float32) for first in range(0, len(cells), _AT_ONCE))
+    return np.concatenate([np.asarray(_verify_many(*verifier, part)) for part in parts])
+
+
+_verify_many = jax.jit(jax.vmap(verify, in_axes=(None, None, 0)), static_argnums=0)
+
+
+def _judged(log_odds: Float[np.ndarray, " p"], right: Float[np.ndarray, " p"]) -> dict[str, Any]:
+    """Return how well log odds tell which poses are right."""
+    chance = float(right.mean())
+    loss = np.logaddexp(0, np.where(right > 0, -log_odds, log_odds)).mean()
+    order = np.argsort(-log_odds, kind="stable")
+    share = np.cumsum(right[order]) / np.arange(1, len(order) + 1)
+    best = np.flatnonzero(share >= _EXACT)
+    found = float(right[order][: best[-1] + 1].sum() / max(right.sum(), 1)) if len(best) else 0.0
+    return {"poses": len(right), "right": chance, "loss": float(loss), f"recall at {_EXACT:.0%} right": found}
+
+
+def _write_card(options: Options, rows: list[dict[str, Any]]) -> None:
+    facts = environment()
+    card = f"""# The pose verifier
+
+Made by `experiments/train_verifier.py`; change that, not this file.
+
+`{options.output.name}`, SHA-256 `{hashlib.sha256(options.output.read_bytes()).hexdigest()[:16]}…`, is what
+`kmn_jax.models.load_verifier` loads: what it says of refined poses is one column of the evidence that probabilities are
+fitted to. It was trained with poses as they are found in known worlds (docs/data.md), over {options.epochs} epochs in
+batches of {options.batch}, by `{facts["command"]}`, commit {facts["commit"]}. "Other parts" are refined poses such as
+detection chooses among, of images and parts that it was not trained with.
+
+{markdown_table(rows)}
+"""
+    write_whole(options.output.with_suffix(".md"), card.encode())
+
+
+if __name__ == "__main__":
+    call_in_place()
+    try:
+        train_verifier(tyro.cli(Options))
+    except InputError as problem:
+        sys.exit(f"error: {problem}")

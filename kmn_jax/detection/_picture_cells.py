@@ -1,0 +1,157 @@
+"""The cells of an object's picture at a pose, as they are predicted and measured, and what a verifier sees of them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from kmn_jax.detection._depth_agreement import DepthImage, depth_at, in_image
+from kmn_jax.geometry import transform_points
+from kmn_jax.models import VERIFIER_CHANNELS
+from kmn_jax.simulate import Surfels
+from kmn_jax.typing import Pose, Scalar
+
+_CELLS = 32  # of the grid, along the longer side of the picture
+_SPARE = 3  # cells beyond it, on each side
+VERIFIER_SIDE = _CELLS + 2 * _SPARE
+_SAMPLES = ((0.0, 0.0), (-0.3, -0.3), (0.3, -0.3), (-0.3, 0.3), (0.3, 0.3))  # places in a cell, in cells
+# Lengths are in diameters of the object.
+LOOSE = 0.04  # between depths
+_ONE_SURFACE = 0.06  # between the depths of neighbouring cells, beyond what the slant of the view explains
+_STEEP = 2.5  # cells: that slant
+_MOST_GAP, _MOST_DEPTH, _MOST_NOISE = 0.06, 0.5, 0.03  # what a verifier is told of
+_HIGHEST = jax.lax.Precision.HIGHEST
+
+
+class Predicted(NamedTuple):
+    """Cells of an object's picture; u and v are directions (u, v, 1) to their centres."""
+
+    mask: Bool[Array, "s s"]
+    depth: Float[Array, "s s"]
+    normals: Float[Array, "s s 3"]
+    u: Float[Array, "s s"]
+    v: Float[Array, "s s"]
+    pitch: Scalar  # of directions
+    nearest: Scalar  # depth of the nearest point
+    surface: Float[Array, "m 3"]  # all of the object's, also what is turned away
+
+
+class Measured(NamedTuple):
+    """The same cells of a depth image."""
+
+    in_image: Bool[Array, "s s"]
+    there: Bool[Array, "s s"]
+    depth: Float[Array, "s s"]
+    away: Float[Array, "s s"]  # of the sample nearest to the predicted depth from it
+    noise: Float[Array, "s s"]
+    points: Float[Array, "s s 3"]
+    normals: Float[Array, "s s 3"]
+    has_normal: Bool[Array, "s s"]
+
+
+def verifier_cells(
+    T_camera_object: Pose, surfels: Surfels, image: DepthImage, diameter: Scalar
+) -> Float[Array, "s s c"]:
+    """Return what `PoseVerifier` looks at: an object at a pose and a depth image in the same unit, cell by cell."""
+    seen = predicted(T_camera_object, surfels, image)
+    found = measured(seen, image, diameter)
+    mask, there = seen.mask, found.there
+    both = mask & there
+    middle = jnp.where(mask, seen.depth, 0).sum() / jnp.maximum(mask.sum(dtype=jnp.float32), 1)
+
+    def within(lengths: Float[Array, "s s"], of: Bool[Array, "s s"], most: float) -> Float[Array, "s s"]:
+        return jnp.where(of, jnp.clip(lengths / diameter, -most, most), 0)
+
+    channels = (
+        mask,
+        there,
+        within(found.depth - seen.depth, both, _MOST_GAP) / _MOST_GAP,
+        within(seen.depth - middle, mask, _MOST_DEPTH),
+        within(found.depth - middle, there, _MOST_DEPTH),
+        jnp.where(mask & found.has_normal, (seen.normals * found.normals).sum(axis=-1), 0),
+        found.has_normal,
+        within(found.away, both, _MOST_GAP) / _MOST_GAP,
+        within(found.noise, there, _MOST_NOISE) / _MOST_NOISE,
+    )
+    assert len(channels) == VERIFIER_CHANNELS
+    return jnp.stack([channel.astype(jnp.float32) for channel in channels], axis=-1)
+
+
+def predicted(T_camera_object: Pose, surfels: Surfels, image: DepthImage) -> Predicted:
+    """Return the cells of an object's picture at a pose, as the image's camera would see it alone."""
+    points = transform_points(T_camera_object, surfels.points)
+    normals = jnp.matmul(surfels.normals, T_camera_object[:3, :3].T, precision=_HIGHEST)
+    facing = ((points * normals).sum(axis=1) < 0) & (points[:, 2] > 0)
+    some = facing.any()
+    nearest = jnp.where(some, jnp.where(facing, points[:, 2], jnp.inf).min(), 1)
+    z = jnp.where(facing, points[:, 2], nearest)
+    directions = points[:, :2] / z[:, None]
+    low, high = (
+        jnp.where(some, bound(jnp.where(facing[:, None], directions, worst), axis=0), 0)
+        for bound, worst in ((jnp.min, jnp.inf), (jnp.max, -jnp.inf))
+    )
+    # No finer than pixels, nor than surfels are apart, so that there is one in or next to each cell of the surface.
+    spacing = jnp.sqrt(surfels.area / surfels.points.shape[0])
+    finest = jnp.maximum(spacing / nearest, 1 / image.camera.fx)
+    pitch = jnp.maximum((high - low).max() / (_CELLS - 1), finest)
+    place = jnp.round((directions - low[None]) / pitch).astype(jnp.int32) + _SPARE
+    index = place[:, 1] * VERIFIER_SIDE + place[:, 0]
+    front = jnp.full(VERIFIER_SIDE**2, jnp.inf).at[jnp.where(facing, index, VERIFIER_SIDE**2)].min(z, mode="drop")
+    # The surface of a cell is what lies about as near as its nearest point.
+    shown = facing & (z <= front[jnp.clip(index, 0, VERIFIER_SIDE**2 - 1)] + spacing + pitch * nearest)
+    columns = jnp.concatenate([normals, z[:, None], jnp.ones_like(z)[:, None]], axis=1)
+    sums = jnp.zeros((VERIFIER_SIDE**2, 5)).at[jnp.where(shown, index, VERIFIER_SIDE**2)].add(columns, mode="drop")
+    mask = (sums[:, 4] > 0).reshape(VERIFIER_SIDE, VERIFIER_SIDE)
+    length = jnp.sqrt(jnp.maximum((sums[:, :3] ** 2).sum(axis=1, keepdims=True), 1e-12))
+    steps = (jnp.arange(VERIFIER_SIDE, dtype=jnp.float32) - _SPARE) * pitch
+    u, v = jnp.meshgrid(low[0] + steps, low[1] + steps)
+    depth = (sums[:, 3] / jnp.maximum(sums[:, 4], 1)).reshape(VERIFIER_SIDE, VERIFIER_SIDE)
+    return Predicted(
+        mask, depth, (sums[:, :3] / length).reshape(VERIFIER_SIDE, VERIFIER_SIDE, 3), u, v, pitch, nearest, points
+    )
+
+
+def measured(seen: Predicted, image: DepthImage, diameter: Scalar) -> Measured:
+    """Return what the same cells are of a depth image; lengths are in its unit."""
+    samples = jnp.stack([depth_at(image, seen.u + du * seen.pitch, seen.v + dv * seen.pitch) for du, dv in _SAMPLES])
+    real = samples > 0
+    there = real.any(axis=0)
+    anchor = jnp.where(real[0], samples[0], samples[1:].max(axis=0))
+    own = real & (jnp.abs(samples - anchor[None]) < LOOSE * diameter)
+    count = jnp.maximum(own.sum(axis=0, dtype=jnp.float32), 1)
+    depth = jnp.where(own, samples, 0).sum(axis=0) / count
+    noise = jnp.sqrt(jnp.where(own, (samples - depth[None]) ** 2, 0).sum(axis=0) / jnp.maximum(count - 1, 1))
+    away = jnp.where(real, jnp.abs(samples - seen.depth[None]), jnp.inf).min(axis=0)
+    points = jnp.stack([seen.u, seen.v, jnp.ones_like(seen.u)], axis=-1) * depth[..., None]
+    reach = _ONE_SURFACE * diameter + _STEEP * seen.pitch * seen.nearest
+    (along_u, has_u), (along_v, has_v) = (_slope(points, there, axis, reach) for axis in (1, 0))
+    normals = jnp.cross(along_v, along_u)
+    length = jnp.sqrt(jnp.maximum((normals**2).sum(axis=-1, keepdims=True), 1e-24))
+    normals = normals / length
+    normals = jnp.where((normals * points).sum(axis=-1, keepdims=True) > 0, -normals, normals)
+    return Measured(
+        in_image(image, seen.u, seen.v),
+        there,
+        depth,
+        away,
+        noise,
+        points,
+        normals,
+        has_u & has_v & (length[..., 0] > 1e-12),
+    )
+
+
+def _slope(
+    points: Float[Array, "s s 3"], there: Bool[Array, "s s"], axis: int, reach: Scalar
+) -> tuple[Float[Array, "s s 3"], Bool[Array, "s s"]]:
+    """Return the way from cell to cell along an axis, where both are on one surface."""
+    ways, known = [], []
+    for step in (-1, 1):
+        way = step * (points - jnp.roll(points, step, axis))
+        same = there & jnp.roll(there, step, axis) & (jnp.abs(way[..., 2]) < reach)
+        ways.append(jnp.where(same[..., None], way, 0))
+        known.append(same)
+    return ways[0] + ways[1], known[0] | known[1]

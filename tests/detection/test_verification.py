@@ -1,0 +1,154 @@
+"""What a verifier sees of a pose, and who is shown to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kmn_jax.detection import (
+    EVIDENCE,
+    VERIFIED,
+    CropSearchConfig,
+    DepthImage,
+    DevicePart,
+    Scene,
+    SearchConfig,
+    candidates_of,
+    gather_evidence,
+    picture_agreement,
+    refined_candidates,
+    verified,
+    verifier_cells,
+)
+from kmn_jax.detection import _detect as detecting
+from kmn_jax.detection import _verification as module
+from kmn_jax.detection._search import no_poses
+from kmn_jax.geometry import intrinsics
+from kmn_jax.models import VERIFIER_CHANNELS, create_verifier, verify
+from kmn_jax.objects import PartArrays
+from kmn_jax.simulate import Surfels
+from tests.detection.box_sample import CAMERA, POSES, box_part, box_view
+from tests.reference.meshes import pose
+
+PART, VIEW = box_part(), box_view()
+SURFELS = Surfels(jnp.asarray(PART.points), jnp.asarray(PART.normals), jnp.float32(PART.area))
+MASK, THERE, GAP, OWN, OTHER, COSINE, HAS_NORMAL, AWAY, NOISE = range(VERIFIER_CHANNELS)
+see = jax.jit(verifier_cells)
+
+
+def cells_of(T: np.ndarray, depth: np.ndarray | None = None, diameter: float = PART.diameter) -> np.ndarray:
+    image = DepthImage(jnp.asarray(VIEW.depth if depth is None else depth), intrinsics(CAMERA))
+    cells = np.asarray(see(jnp.asarray(T, dtype=jnp.float32), SURFELS, image, jnp.float32(diameter)))
+    assert np.isfinite(cells).all()
+    assert np.abs(cells).max() <= 1
+    return cells
+
+
+def test_at_the_right_pose_the_cells_agree() -> None:
+    cells = cells_of(POSES[0])
+    mask = cells[..., MASK] > 0
+    assert 0.1 < mask.mean() < 0.8
+    inside = mask & (cells[..., COSINE] > 0)
+    assert np.abs(cells[..., GAP][inside]).mean() < 0.1  # in 6% of the diameter
+    np.testing.assert_allclose(cells[..., OWN][mask].mean(), 0, atol=1e-5)
+    assert np.abs(cells[..., OWN] - cells[..., OTHER])[inside].mean() < 0.01
+    assert (cells[..., COSINE][inside] > 0.9).mean() > 0.8
+    assert (cells[..., (GAP, OWN, AWAY)][~mask] == 0).all()
+    beyond = (cells[..., THERE] > 0) & ~mask
+    assert (np.isin(cells[..., OTHER][beyond], 0.5) | (np.abs(cells[..., OTHER][beyond]) < 0.1)).mean() > 0.95
+    agreement = picture_agreement(
+        jnp.asarray(POSES[0], dtype=jnp.float32), SURFELS, _image(), jnp.float32(PART.diameter)
+    )
+    near = (cells[..., AWAY] < 0.02 / 0.06) & (cells[..., THERE] > 0)
+    assert (near & mask).sum() / mask.sum() == pytest.approx(float(agreement.near))
+
+
+def test_farther_and_nearer_are_told_apart() -> None:
+    shift = 0.02 * PART.diameter
+    for way in (-1, 1):
+        cells = cells_of(POSES[0] @ pose((0.0, 0.0, way * shift)))
+        gaps = cells[..., GAP][(cells[..., MASK] > 0) & (cells[..., COSINE] > 0.9)]
+        assert np.median(gaps) == pytest.approx(-way / 3, abs=0.05)
+
+
+def test_they_do_not_depend_on_the_unit_of_length() -> None:
+    T = POSES[0].copy()
+    T[:3, 3] *= 1000
+    surfels = Surfels(1000 * SURFELS.points, SURFELS.normals, 1e6 * SURFELS.area)
+    image = DepthImage(1000 * jnp.asarray(VIEW.depth), intrinsics(CAMERA))
+    large = see(jnp.asarray(T, dtype=jnp.float32), surfels, image, jnp.float32(1000 * PART.diameter))
+    different = np.abs(np.asarray(large) - cells_of(POSES[0])) > 1e-2
+    assert different.mean() < 0.002  # where cells are as near to one pixel as to another
+
+
+@pytest.mark.parametrize("T", [pose((0.0, 0.0, -3.0)), pose((9.0, 0.0, 3.0))])
+def test_of_a_pose_that_cannot_be_seen_nothing_is_said(T: np.ndarray) -> None:
+    cells = cells_of(T)
+    assert (cells[..., (GAP, AWAY, COSINE)] == 0).all()
+
+
+def test_poses_are_verified_as_their_cells_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    verifier = create_verifier(jax.random.key(0))
+    monkeypatch.setattr(module, "_shipped", lambda: verifier)
+    poses = np.stack([POSES[0], POSES[1], pose((0.3, 0.1, 3.2))]).astype(np.float32)
+    part = _on_device()
+    found = verified(poses, part, VIEW)
+    wanted = [float(verify(*verifier, jnp.asarray(cells_of(T)))) for T in poses]
+    np.testing.assert_allclose(found, wanted, atol=1e-4)
+    assert np.ptp(found) > 0.01
+    many = module._verify_many(poses, *verifier, part.surfels, VIEW.image, part.arrays.diameter)
+    np.testing.assert_allclose(many, wanted, atol=1e-4)
+    assert verified(poses[:0], part, VIEW).shape == (0,)
+
+
+def test_refined_poses_alone_are_shown_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three candidates of two crops are refined, in two forms each, of which one is missing."""
+    shown: list[np.ndarray] = []
+
+    def refined(poses: np.ndarray, *given: object) -> tuple[np.ndarray, np.ndarray]:
+        forms = np.stack([poses, poses], axis=1)
+        forms[:, 1, 0, 3] += 100
+        return forms, np.array([[True, True], [True, False], [True, True]])
+
+    def said(poses: np.ndarray, part: DevicePart, scene: Scene) -> np.ndarray:
+        shown.append(poses)
+        return poses[:, 0, 3]
+
+    def rows(one: object, many: Callable[..., Any], *items: Any) -> Any:
+        return many(*items)
+
+    monkeypatch.setattr(detecting, "call_rows", rows)
+    monkeypatch.setattr(detecting, "refine_many", refined)
+    monkeypatch.setattr(detecting, "polish_many", lambda poses, part, image: poses)
+    monkeypatch.setattr(detecting, "verified", said)
+    config = SearchConfig(CropSearchConfig(num_points=64, num_draws=1))
+    none = no_poses(config.crops, 8)
+    crops = jax.tree.map(lambda leaf: np.stack([np.asarray(leaf)] * 2), none)
+    count = config.crops.num_poses
+    poses = np.tile(np.eye(4, dtype=np.float32), (2 * count, 1, 1))
+    poses[:, 0, 3] = np.arange(2 * count)
+    evidence = np.zeros((2, count, len(EVIDENCE)), dtype=np.float32)
+    found = candidates_of(crops, evidence, np.array([3, 7]))._replace(T_camera_object=poses)
+    chosen = np.array([0, 1, count])
+    fine = refined_candidates(_on_device(), VIEW, found, chosen, 0, config)
+    np.testing.assert_array_equal(fine.T_camera_object[:, 0, 3], [*chosen, *(chosen + 100)])
+    np.testing.assert_array_equal(fine.usable, [True, True, True, True, False, True])
+    column = fine.evidence[:, EVIDENCE.index(VERIFIED)]
+    np.testing.assert_array_equal(column, np.where(fine.usable, fine.T_camera_object[:, 0, 3], 0))
+    assert [len(part) for part in shown] == [5]
+    of_found = gather_evidence(none, _on_device().arrays, _on_device().surfels, VIEW.image, config.agreement)
+    assert (np.asarray(of_found)[:, EVIDENCE.index(VERIFIED)] == 0).all()
+
+
+def _image() -> DepthImage:
+    return DepthImage(jnp.asarray(VIEW.depth), intrinsics(CAMERA))
+
+
+def _on_device() -> DevicePart:
+    arrays = PartArrays(SURFELS.points, SURFELS.normals, jnp.zeros((len(PART.points), 1)), jnp.float32(PART.diameter))
+    return DevicePart(arrays, SURFELS, jnp.eye(4)[None], jnp.float32(0.1), jnp.eye(4)[None], jnp.zeros(1, bool))
