@@ -203,15 +203,18 @@ def _judged(log_odds: Float[np.ndarray, " p"], right: Float[np.ndarray, " p"]) -
 
 def _write_card(options: Options, rows: list[dict[str, Any]]) -> None:
     facts = environment()
+    digest = hashlib.sha256(options.output.read_bytes()).hexdigest()
     card = f"""# The pose verifier
 
 Made by `experiments/train_verifier.py`; change that, not this file.
 
-`{options.output.name}`, SHA-256 `{hashlib.sha256(options.output.read_bytes()).hexdigest()[:16]}…`, is what
-`kmn_jax.models.load_verifier` loads: what it says of refined poses is one column of the evidence that probabilities are
-fitted to. It was trained with poses as they are found in known worlds (docs/data.md), over {options.epochs} epochs in
-batches of {options.batch}, by `{facts["command"]}`, commit {facts["commit"]}. "Other parts" are refined poses such as
-detection chooses among, of images and parts that it was not trained with.
+- **Weights**: `{options.output.name}`, SHA-256 `{digest[:16]}…`; `kmn_jax.models.load_verifier` loads them. What they say
+  of refined poses is one column of the evidence that probabilities are fitted to.
+- **Data**: poses as they are found in known worlds (docs/data.md), {options.epochs} epochs in batches of {options.batch}.
+- **Command**: `{facts["command"]}`, commit {facts["commit"]}.
+
+Of poses by what it says alone; "other parts" are refined poses such as detection chooses among, of images and parts
+that it was not trained with:
 
 {markdown_table(rows)}
 """
