@@ -208,9 +208,9 @@ def _write_card(options: Options, rows: list[dict[str, Any]]) -> None:
 
 Made by `experiments/train_verifier.py`; change that, not this file.
 
-- **Weights**: `{options.output.name}`, SHA-256 `{digest[:16]}…`; `kmn_jax.models.load_verifier` loads them. What they say
-  of refined poses is one column of the evidence that probabilities are fitted to.
-- **Data**: poses as they are found in known worlds (docs/data.md), {options.epochs} epochs in batches of {options.batch}.
+- **Weights**: `{options.output.name}`, SHA-256 `{digest[:16]}…`; `kmn_jax.models.load_verifier` loads them. What they
+  say of refined poses is one column of the evidence that probabilities are fitted to.
+- **Data**: poses as they are found in known worlds (docs/data.md); {options.epochs} epochs, batches of {options.batch}.
 - **Command**: `{facts["command"]}`, commit {facts["commit"]}.
 
 Of poses by what it says alone; "other parts" are refined poses such as detection chooses among, of images and parts
