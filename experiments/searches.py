@@ -164,6 +164,11 @@ def _asked(image: TrueImage, row: int, is_known: bool) -> Iterator[tuple[Part, F
 
 
 def _images(sources: Sources, network: Model) -> Iterator[_Image]:
+    worlds = [(0, sources.worlds)] if sources.worlds else []
+    worlds += [(1, known) for known in sources.known_worlds]
+    named = [_name(world) for _, world in worlds]
+    if len(set(named)) < len(named):
+        raise InputError(f"worlds are told apart by their folders' names, but these are {', '.join(named)}: rename one")
     folders = sorted(path for path in sources.bins.glob("*") if (path / SPLIT).is_dir())
     if not folders:
         raise InputError(f"{sources.bins} holds no datasets: python -m experiments.build_data validation-bins")
@@ -171,11 +176,7 @@ def _images(sources: Sources, network: Model) -> Iterator[_Image]:
         bins = tqdm(bin_images(folder, SPLIT, network, sources.every), unit="image", desc=folder.name)
         for row, image in enumerate(bins):
             yield _Image(_name(folder), row, 1000 * number + image.key.scene_id, image, _scene_of(image), False)
-    named = [_name(folder) for folder in (*filter(None, [sources.worlds]), *sources.known_worlds)]
-    if len(set(named)) < len(named):
-        raise InputError(f"worlds are told apart by their folders' names, but these are {', '.join(named)}: rename one")
-    worlds = [(0, sources.worlds)] if sources.worlds else []
-    for number, world in (*worlds, *((1, known) for known in sources.known_worlds)):
+    for number, world in worlds:
         for row, found in enumerate(tqdm(world_images(world, network), unit="image", desc=f"worlds {world.name}")):
             scene = _scene_of_world(found, row)
             yield _Image(_name(world), row, _KINDS * number + found.kind, found, scene, number == 1)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -117,6 +118,27 @@ def test_each_search_has_a_name_of_its_own_and_makes_what_it_takes_when_that_is_
         f"{name} on device" for name in ("own", "a", "own", "own")
     ]
     assert made == ["own", "a", "own"]  # once of each folder
+
+
+def test_known_worlds_come_last_and_share_the_numbers_of_their_families(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """So that what is found elsewhere has the same rows whether they are named or not."""
+    (tmp_path / "bins" / "a" / module.SPLIT).mkdir(parents=True)
+    image = SimpleNamespace(key=FrameKey(5, 0), scene=None)
+    monkeypatch.setattr(module, "bin_images", lambda *given: [image])
+    monkeypatch.setattr(module, "world_images", lambda folder, network: [world(), world()])
+    folders = tmp_path / "worlds" / "validation", tmp_path / "worlds" / "b", tmp_path / "worlds" / "a"
+    sources, nothing = Sources(bins=tmp_path / "bins", worlds=folders[0], known_worlds=folders[1:]), cast(Any, None)
+    found = [(one.folder, one.row, one.number, one.is_known) for one in module._images(sources, nothing)]
+    assert found == [
+        ("bins-a", 0, 1005, False),
+        *(("worlds-validation", row, 2, False) for row in range(2)),
+        *((f"worlds-{name}", row, 102, True) for name in "ba" for row in range(2)),
+    ]
+    twice = replace(sources, known_worlds=(tmp_path / "worlds" / "validation",))
+    with pytest.raises(InputError, match="these are worlds-validation, worlds-validation: rename one"):
+        next(module._images(twice, nothing))
 
 
 def test_a_stranger_that_looks_like_the_part_is_neither_right_nor_wrong() -> None:
