@@ -73,11 +73,11 @@ def model_of(poses: dict[str, np.ndarray], options: FitOptions) -> Calibration:
     """Return the model that is fitted to those poses that are `told`, of one member if any is as it was found."""
     members = options.members if poses["refined"].all() else 1  # one is enough to choose what is refined
     poses = told(poses)
-    right, weights = poses["error"] < THRESHOLD, _weights(poses, options)
+    right, weights = poses["error"] < THRESHOLD, weights_of(poses, options)
     return fit_calibration(poses["evidence"], right, EVIDENCE, weights, members=members)
 
 
-def _weights(poses: dict[str, np.ndarray], options: FitOptions) -> Float[np.ndarray, " s"]:
+def weights_of(poses: dict[str, np.ndarray], options: FitOptions) -> Float[np.ndarray, " s"]:
     """Return how much poses count: refined ones of absent parts, and what is reported, more, and all less of an object
     that has many.
 

@@ -27,9 +27,10 @@ from tqdm import tqdm
 
 from experiments.bins import THRESHOLD
 from experiments.candidates import read_poses, searches_of
-from experiments.fits import FitOptions, told
+from experiments.detect_bins import PRECISION, Tally
+from experiments.fits import FitOptions, told, weights_of
 from experiments.searches import Columns, Sources
-from kmn_jax.detection import VERIFIER_SIDE, call_rows, verifier_cells
+from kmn_jax.detection import PICTURE_SIDE, call_rows, verifier_cells
 from kmn_jax.errors import InputError, require
 from kmn_jax.files import write_whole
 from kmn_jax.models import (
@@ -49,7 +50,6 @@ from kmn_jax.typing import PRNGKey, Scalar
 
 _AT_ONCE = 256  # poses that are verified
 _LEAST_RATE = 1e-6
-_EXACT = 0.95  # share of right poses, for which recall is told
 
 
 @dataclass(frozen=True)
@@ -91,9 +91,8 @@ def train_verifier(options: Options) -> dict[str, Any]:
     cells = _cells_of(poses, options, network)
     known = poses["known"]
     right = (poses["error"] < THRESHOLD).astype(np.float32)
-    _, kind, counts = np.unique(poses["object"][known], return_inverse=True, return_counts=True)
-    weights = 1 / np.sqrt(counts[kind])
-    verifier = fitted(cells[known], right[known], (weights / weights.mean()).astype(np.float32), options)
+    weights = weights_of({name: values[known] for name, values in poses.items()}, options).astype(np.float32)
+    verifier = fitted(cells[known], right[known], weights, options)
     save_verifier(verifier, options.output)
     log_odds = log_odds_of(verifier, cells)
     splits = {"known parts": known, "other parts": ~known}
@@ -107,7 +106,7 @@ def train_verifier(options: Options) -> dict[str, Any]:
 
 def _cells_of(poses: Columns, options: Options, network: Model) -> Float16[np.ndarray, "p s s c"]:
     """Return what a verifier sees of each pose."""
-    cells = np.empty((len(poses["error"]), VERIFIER_SIDE, VERIFIER_SIDE, VERIFIER_CHANNELS), dtype=np.float16)
+    cells = np.empty((len(poses["error"]), PICTURE_SIDE, PICTURE_SIDE, VERIFIER_CHANNELS), dtype=np.float16)
     for search, rows in searches_of(poses, options, network):
         given = search.on_device.surfels, search.scene.image, search.on_device.arrays.diameter
         cells[rows] = call_rows(
@@ -192,13 +191,11 @@ _verify_many = jax.jit(jax.vmap(verify, in_axes=(None, None, 0)), static_argnums
 
 def _judged(log_odds: Float[np.ndarray, " p"], right: Float[np.ndarray, " p"]) -> dict[str, Any]:
     """Return how well log odds tell which poses are right."""
-    chance = float(right.mean())
     loss = np.logaddexp(0, np.where(right > 0, -log_odds, log_odds)).mean()
-    order = np.argsort(-log_odds, kind="stable")
-    share = np.cumsum(right[order]) / np.arange(1, len(order) + 1)
-    best = np.flatnonzero(share >= _EXACT)
-    found = float(right[order][: best[-1] + 1].sum() / max(right.sum(), 1)) if len(best) else 0.0
-    return {"poses": len(right), "right": chance, "loss": float(loss), f"recall at {_EXACT:.0%} right": found}
+    is_right = (right > 0).tolist()
+    found = Tally(log_odds.tolist(), is_right, is_right, sum(is_right)).recall_at(PRECISION)
+    shares = {"right": float(right.mean()), "loss": float(loss), f"recall at {PRECISION:.0%} right": found}
+    return {"poses": len(right)} | shares
 
 
 def _write_card(options: Options, rows: list[dict[str, Any]]) -> None:

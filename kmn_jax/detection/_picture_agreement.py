@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from kmn_jax.detection._cells import fit_plane, grown, most, places_of, summed
 from kmn_jax.detection._depth_agreement import DepthImage
-from kmn_jax.detection._picture_cells import LOOSE, VERIFIER_SIDE, Measured, Predicted, measured, predicted
+from kmn_jax.detection._picture_cells import LOOSE, PICTURE_SIDE, Measured, Predicted, measured, predicted
 from kmn_jax.simulate import Surfels
 from kmn_jax.typing import Pose, Scalar
 
@@ -196,7 +196,7 @@ def _outline(seen: Predicted, found: Measured, compared: Bool[Array, "s s"], dia
     # The plane of what is measured on the object near by.
     count, normal, center = (
         summed(jnp.where(compared[..., None], values, 0), _REACH)
-        for values in (jnp.ones((VERIFIER_SIDE, VERIFIER_SIDE, 1)), found.normals, found.points)
+        for values in (jnp.ones((PICTURE_SIDE, PICTURE_SIDE, 1)), found.normals, found.points)
     )
     normal = normal / jnp.sqrt(jnp.maximum((normal**2).sum(axis=-1, keepdims=True), 1e-24))
     height = ((found.points - center / jnp.maximum(count, 1)) * normal).sum(axis=-1) / diameter

@@ -16,7 +16,7 @@ from kmn_jax.typing import Pose, Scalar
 
 _CELLS = 32  # of the grid, along the longer side of the picture
 _SPARE = 3  # cells beyond it, on each side
-VERIFIER_SIDE = _CELLS + 2 * _SPARE
+PICTURE_SIDE = _CELLS + 2 * _SPARE
 _SAMPLES = ((0.0, 0.0), (-0.3, -0.3), (0.3, -0.3), (-0.3, 0.3), (0.3, 0.3))  # places in a cell, in cells
 # Lengths are in diameters of the object.
 LOOSE = 0.04  # between depths
@@ -98,19 +98,19 @@ def predicted(T_camera_object: Pose, surfels: Surfels, image: DepthImage) -> Pre
     finest = jnp.maximum(spacing / nearest, 1 / image.camera.fx)
     pitch = jnp.maximum((high - low).max() / (_CELLS - 1), finest)
     place = jnp.round((directions - low[None]) / pitch).astype(jnp.int32) + _SPARE
-    index = place[:, 1] * VERIFIER_SIDE + place[:, 0]
-    front = jnp.full(VERIFIER_SIDE**2, jnp.inf).at[jnp.where(facing, index, VERIFIER_SIDE**2)].min(z, mode="drop")
+    index = place[:, 1] * PICTURE_SIDE + place[:, 0]
+    front = jnp.full(PICTURE_SIDE**2, jnp.inf).at[jnp.where(facing, index, PICTURE_SIDE**2)].min(z, mode="drop")
     # The surface of a cell is what lies about as near as its nearest point.
-    shown = facing & (z <= front[jnp.clip(index, 0, VERIFIER_SIDE**2 - 1)] + spacing + pitch * nearest)
+    shown = facing & (z <= front[jnp.clip(index, 0, PICTURE_SIDE**2 - 1)] + spacing + pitch * nearest)
     columns = jnp.concatenate([normals, z[:, None], jnp.ones_like(z)[:, None]], axis=1)
-    sums = jnp.zeros((VERIFIER_SIDE**2, 5)).at[jnp.where(shown, index, VERIFIER_SIDE**2)].add(columns, mode="drop")
-    mask = (sums[:, 4] > 0).reshape(VERIFIER_SIDE, VERIFIER_SIDE)
+    sums = jnp.zeros((PICTURE_SIDE**2, 5)).at[jnp.where(shown, index, PICTURE_SIDE**2)].add(columns, mode="drop")
+    mask = (sums[:, 4] > 0).reshape(PICTURE_SIDE, PICTURE_SIDE)
     length = jnp.sqrt(jnp.maximum((sums[:, :3] ** 2).sum(axis=1, keepdims=True), 1e-12))
-    steps = (jnp.arange(VERIFIER_SIDE, dtype=jnp.float32) - _SPARE) * pitch
+    steps = (jnp.arange(PICTURE_SIDE, dtype=jnp.float32) - _SPARE) * pitch
     u, v = jnp.meshgrid(low[0] + steps, low[1] + steps)
-    depth = (sums[:, 3] / jnp.maximum(sums[:, 4], 1)).reshape(VERIFIER_SIDE, VERIFIER_SIDE)
+    depth = (sums[:, 3] / jnp.maximum(sums[:, 4], 1)).reshape(PICTURE_SIDE, PICTURE_SIDE)
     return Predicted(
-        mask, depth, (sums[:, :3] / length).reshape(VERIFIER_SIDE, VERIFIER_SIDE, 3), u, v, pitch, nearest, points
+        mask, depth, (sums[:, :3] / length).reshape(PICTURE_SIDE, PICTURE_SIDE, 3), u, v, pitch, nearest, points
     )
 
 

@@ -121,13 +121,13 @@ def test_absent_parts_count_more_among_refined_poses() -> None:
 def test_an_object_with_four_times_the_poses_counts_twice() -> None:
     rows = {"object": np.repeat([3, 7], [100, 25]), "error": np.zeros(125), "refined": np.ones(125, dtype=bool)}
     rows["reported"] = np.zeros(125, dtype=bool)
-    weights = fits._weights(rows, FitOptions())
+    weights = fits.weights_of(rows, FitOptions())
     np.testing.assert_allclose([weights[:100].sum(), weights[100:].sum()], [125 * 2 / 3, 125 / 3])
     rows["error"][0] = np.inf  # the object is not there
-    first, second = fits._weights(rows, FitOptions(absent_weight=3))[:2]
+    first, second = fits.weights_of(rows, FitOptions(absent_weight=3))[:2]
     np.testing.assert_allclose(first, 3 * second)
     rows["reported"][1] = True
-    first, second, third = fits._weights(rows, FitOptions(absent_weight=3, reported_weight=8))[:3]
+    first, second, third = fits.weights_of(rows, FitOptions(absent_weight=3, reported_weight=8))[:3]
     np.testing.assert_allclose([first, second], [3 * third, 8 * third])
 
 

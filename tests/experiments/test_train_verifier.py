@@ -80,8 +80,9 @@ def test_known_parts_are_learned_from_and_others_told_of(tmp_path: Path, monkeyp
         "error": np.where(right > 0, 0.01, np.inf),
         "object": np.repeat([101, 102, 3], [40, 20, 20]),
         "known": np.arange(80) < 60,
-        "refined": np.arange(80) % 2 == 0,
+        "refined": np.arange(80) >= 60,  # of known parts nothing is
         "due": (np.arange(80) >= 60) & (np.arange(80) % 4 == 0),
+        "reported": np.zeros(80, dtype=bool),
         "row": np.arange(80),
     }
     poses["error"][5] = np.nan  # neither right nor wrong
@@ -120,7 +121,7 @@ def test_each_pose_has_the_cells_of_its_own_search(tmp_path: Path, monkeypatch: 
             yield search, np.flatnonzero(poses["search"] == row)
 
     def cells(pose: np.ndarray, surfels: float, image: float, diameter: float) -> np.ndarray:
-        shape = (module.VERIFIER_SIDE, module.VERIFIER_SIDE, VERIFIER_CHANNELS)
+        shape = (module.PICTURE_SIDE, module.PICTURE_SIDE, VERIFIER_CHANNELS)
         return np.full(shape, pose[0, 3] + image + surfels * diameter)
 
     monkeypatch.setattr(module, "searches_of", searched)
