@@ -10,8 +10,8 @@ test-sets    7 electronic and 7 industrial objects in 20 bins each, rendered by 
              digests are compared with those in `assets/test_sets.json`.
 validation-bins  the 50 validation components in 6 bins each, rendered by ray casting, one half as a perfect sensor sees
              them, the other as a structured-light scanner: what the probabilities of detections are fitted on.
-worlds       bins, trays and tables of many kinds (`experiments/worlds.py`), of parts made by parameters: three sets to
-             fit probabilities on, of which two are also for the pose verifier, and one to test on.
+worlds       bins, trays and tables of many kinds (`experiments/worlds.py`), of parts made by parameters: four sets to
+             fit probabilities on, of which three are also for the pose verifier, and one to test on.
 per-object   the pack of one part, for a network of its own: 160 training and 160 validation scenes.
 check        what a pack holds: every file against its checksum, every copy against the walls of its bin.
 small        the few objects and images that the repository carries: `assets/small_pack`, `assets/small_test_set`.
@@ -47,7 +47,7 @@ from experiments.test_sets import (
     verdict,
 )
 from experiments.training_parts import PARTS_SEED, TRAINING_FAMILIES
-from experiments.worlds import TEST, TRAINING, VALIDATION, VERIFIER, build_worlds
+from experiments.worlds import COMPOUND, TEST, TRAINING, VALIDATION, VERIFIER, build_worlds
 from kmn_jax.data import Pack, PackConfig, PackedObject, Record, Source, build_pack
 from kmn_jax.errors import InputError
 from kmn_jax.simulate import PERFECT, BinScene, SensorConfig
@@ -162,7 +162,8 @@ class Worlds:
     record: bool = False  # write the digests into the repository instead
 
     def run(self) -> None:
-        recipes = {"training": TRAINING, "verifier": VERIFIER, "validation": VALIDATION, "test": TEST}
+        known = {"training": TRAINING, "verifier": VERIFIER, "compound": COMPOUND}
+        recipes = known | {"validation": VALIDATION, "test": TEST}
         digests = {
             f"worlds_{name}": build_worlds(self.folder / name, own, self.workers) for name, own in recipes.items()
         }

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.solids import Solid, bent_tube, box, circle, moved, pierced, prism, rectangle, revolved, union
-from experiments.training_parts import TRAINING_FAMILIES
+from experiments.training_parts import COMPOUNDS, TRAINING_FAMILIES
 from kmn_jax.files import write_whole
 
 
@@ -145,7 +145,7 @@ FAMILIES: Mapping[str, Callable[[np.random.Generator], Solid]] = {
         washer, stepped_shaft, angle_bracket, perforated_plate, flanged_tube, lever,
         hex_nut, hex_bolt, bent_sheet, elbow, mug, flange_motor,
     )
-} | dict(TRAINING_FAMILIES)  # fmt: skip
+} | dict(TRAINING_FAMILIES) | dict(COMPOUNDS)  # fmt: skip
 VALIDATION_FAMILIES = ("washer", "stepped_shaft", "angle_bracket", "perforated_plate", "flanged_tube", "lever")
 TEST_FAMILIES = ("hex_nut", "hex_bolt", "bent_sheet", "elbow", "mug", "flange_motor")
 

@@ -1,13 +1,16 @@
 """CAD parts made by parameters, to train on beside the electronic components, which are hardly ever thin or hollow.
 
-No family is one of those that world bins are made of (`experiments.parametric_parts`). Lengths are in millimetres.
+No family is one of those that world bins for validation or test are made of (`experiments.parametric_parts`). Lengths
+are in millimetres.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from experiments.solids import Solid, bent_tube, box, circle, moved, pierced, prism, rectangle, revolved, union
 
@@ -201,3 +204,51 @@ TRAINING_FAMILIES: Mapping[str, Callable[[np.random.Generator], Solid]] = {
         clip, spool, clevis, standoff, slotted_plate, housing, knob, dowel,
     )
 }  # fmt: skip
+
+
+_SECONDS = (1, 3, 6, 10)  # of which families solids are grown onto those of one, by their distance in the list
+
+
+def compound(first: str, second: str, rng: np.random.Generator) -> Solid:
+    """A part of one family, always the same one, with a smaller one of another grown onto its side.
+
+    Parts with one `first` share most of their surface, so that only what is beyond it tells one from the other.
+    """
+    base = TRAINING_FAMILIES[first](np.random.default_rng((PARTS_SEED, list(TRAINING_FAMILIES).index(first))))
+    vertices, triangles = TRAINING_FAMILIES[second](rng)
+    vertices = vertices * rng.uniform(0.35, 0.8) * _diagonal(base[0]) / _diagonal(vertices)
+    place, outwards = _place_on(base, rng)
+    turns = rng.permutation(np.array(list(np.ndindex(4, 4, 4))))
+    root, along = _place_on((vertices, triangles), rng)
+    turned = [_turned(np.stack([root, along, *vertices]), turn) for turn in turns]
+    best = min(turned, key=lambda rows: round(float(rows[1] @ outwards), 6))  # of those that are equal the first
+    sunk = 0.04 * _diagonal(base[0])
+    joined, faces = union(base, (best[2:] - best[0] + place - sunk * outwards, triangles))
+    return joined * rng.uniform(30, 110) / np.ptp(joined, axis=0).max(), faces
+
+
+def _diagonal(vertices: Float[np.ndarray, "v 3"]) -> float:
+    return float(np.linalg.norm(np.ptp(vertices, axis=0)))
+
+
+def _place_on(solid: Solid, rng: np.random.Generator) -> Float[np.ndarray, "2 3"]:
+    """Return a point on the surface of a solid, and the normal there."""
+    corners = solid[0][solid[1]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(normals, axis=1)
+    row = rng.choice(len(areas), p=areas / areas.sum())
+    return np.stack([rng.dirichlet(np.ones(3)) @ corners[row], normals[row] / areas[row]])
+
+
+def _turned(points: Float[np.ndarray, "v 3"], quarters: Int[np.ndarray, " 3"]) -> Float[np.ndarray, "v 3"]:
+    """Return points after so many quarters of a turn about each axis."""
+    for axis, count in enumerate(quarters):
+        points = moved((points, np.zeros((0, 3), dtype=int)), (0, 0, 0), count * np.pi / 2, axis)[0]
+    return points
+
+
+COMPOUNDS: Mapping[str, Callable[[np.random.Generator], Solid]] = {
+    f"{first}_with_{second}": partial(compound, first, second)
+    for row, first in enumerate(TRAINING_FAMILIES)
+    for second in (list(TRAINING_FAMILIES)[(row + step) % len(TRAINING_FAMILIES)] for step in _SECONDS)
+}

@@ -1,11 +1,11 @@
 """World bins: scenes of many kinds under physics, to fit probabilities on and to test on, as BOP datasets.
 
 Training (of parts that the network was trained with), verifier (of the same families of parts, but others of each),
-validation and test differ in random seeds and in the families of parts (`experiments.parametric_parts`), the test also
-in the ranges of containers. Each family of worlds is one scene of the dataset, `worlds.json` names them; of each
-scene's images some show no copy of the part that is asked for, but other parts or nothing. `test_targets_bop19.json`
-says which part is asked for in which image, with the number of its copies; other parts have no entries in
-scene_gt.json.
+compound (of parts that are grown together of two of them), validation and test differ in random seeds and in the
+families of parts (`experiments.parametric_parts`), the test also in the ranges of containers. Each family of worlds is
+one scene of the dataset, `worlds.json` names them; of each scene's images some show no copy of the part that is asked
+for, but other parts or nothing. `test_targets_bop19.json` says which part is asked for in which image, with the number
+of its copies; other parts have no entries in scene_gt.json.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 
 from experiments.parametric_parts import TEST_FAMILIES, VALIDATION_FAMILIES, write_parts
 from experiments.test_sets import SPLIT, claim, metric_model, write_scenes
-from experiments.training_parts import PARTS_SEED, TRAINING_FAMILIES
+from experiments.training_parts import COMPOUNDS, PARTS_SEED, TRAINING_FAMILIES
 from kmn_jax.bop import (
     BopFrame,
     dataset_digest,
@@ -119,6 +119,8 @@ class Recipe:
 TRAINING = Recipe(PARTS_SEED, tuple(TRAINING_FAMILIES), 1.0, sensors=("stereo", "time_of_flight"))
 # The same families of parts by other numbers, for the pose verifier, which needs more scans than parts.
 VERIFIER = Recipe(14, tuple(TRAINING_FAMILIES), 1.0, parts_a_family=4, sensors=TRAINING.sensors)
+# Of two of these families each, as the verifier wants many kinds of parts, and such as have a piece in common.
+COMPOUND = Recipe(15, tuple(COMPOUNDS), 1.0, parts_a_family=1, sensors=TRAINING.sensors)
 VALIDATION = Recipe(11, VALIDATION_FAMILIES, 1.0, parts_a_family=4, images=16)
 TEST = Recipe(12, TEST_FAMILIES, 1.15)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.parametric_parts import FAMILIES, TEST_FAMILIES, VALIDATION_FAMILIES, write_parts
-from experiments.training_parts import TRAINING_FAMILIES
+from experiments.training_parts import COMPOUNDS, TRAINING_FAMILIES
 from kmn_jax.objects import load_object
 from kmn_jax.simulate import collision_shape
 
@@ -38,9 +38,20 @@ def test_bores_go_through(family: str) -> None:
 
 
 def test_no_family_is_in_two_sets() -> None:
-    names = [*VALIDATION_FAMILIES, *TEST_FAMILIES, *TRAINING_FAMILIES]
+    names = [*VALIDATION_FAMILIES, *TEST_FAMILIES, *TRAINING_FAMILIES, *COMPOUNDS]
     assert len(set(names)) == len(names)
     assert set(names) == set(FAMILIES)
+
+
+def test_compounds_share_one_piece_and_differ_in_the_other() -> None:
+    name = next(iter(COMPOUNDS))
+    first, _ = name.split("_with_")
+    assert sum(other.startswith(f"{first}_with_") for other in COMPOUNDS) == 4
+    shapes = [COMPOUNDS[name](np.random.default_rng(number))[0] for number in range(2)]
+    base = len(TRAINING_FAMILIES[first](np.random.default_rng(0))[0])  # of a channel, which always has as many corners
+    own, other = (np.linalg.norm(np.diff(shape[:base], axis=0), axis=1) for shape in shapes)
+    np.testing.assert_allclose(own / own.sum(), other / other.sum())  # the same, but for the size of the whole
+    assert not np.allclose(*(np.ptp(shape, axis=0) / np.ptp(shape[:base], axis=0) for shape in shapes))
 
 
 def test_files_repeat_and_become_objects(tmp_path: Path) -> None:
