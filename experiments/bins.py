@@ -109,7 +109,7 @@ class WorldImage(TrueImage):
     """One image of a world; the part is the one that is asked for, and there may be no copy of it."""
 
     family: str
-    kind: int  # that parts of one family share
+    kind: str  # the part's family
     scan: Scan
 
     def cloud(self, margin: float | None = None) -> Scan:
@@ -181,7 +181,6 @@ def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldIm
     targets = read_targets(folder)
     dataset, parts = _opened(folder, SPLIT, model)
     kinds = {object_id: kind_of(dataset.model(object_id).name or "") for object_id in parts}
-    numbers = {kind: number for number, kind in enumerate(dict.fromkeys(kinds.values()))}
     keys = set(dataset.keys)
     for key, object_id, family in targets[::every]:
         if key not in keys or object_id not in parts:
@@ -200,7 +199,7 @@ def world_images(folder: Path, model: Model, every: int = 1) -> Iterator[WorldIm
             () if may_lie else _like_in_size(part, others),
             *_truth(instances),
             family,
-            numbers[kinds[object_id]],
+            kinds[object_id],
             _scan(frame),
         )
 

@@ -50,13 +50,12 @@ _COLUMNS = (  # of what is stored
     "object",
     "search",
     "known",  # whether the network, and the verifier, were trained with such parts
-    "narrowed",
     "T_camera_object",
     "refined",
     "due",  # whether they are of what detection chooses among, which refines less
     "reported",
 )
-_HOW = 6  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
+_HOW = 7  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
 _IN_MEMORY = 600  # searches, of each of which what was found first, crops and all, takes 10 MB
 _AT_ONCE = 2  # searches: one alone leaves a part of two cores idle
 
@@ -202,7 +201,8 @@ class _Kept:
             columns = make(search)
             if path:
                 _write(path, columns)
-        of_search = {"search": search.row, "known": search.is_known}  # the row may be another one today
+        # Row and number may be others today.
+        of_search = {"search": search.row, "object": search.number, "known": search.is_known}
         return columns | {name: np.full(len(columns["error"]), value) for name, value in of_search.items()}
 
 

@@ -27,7 +27,7 @@ Form = Literal["image", "cloud", "cut-out"]  # what users may have: depth images
 _FORMS: tuple[Form, ...] = get_args(Form)
 _MARGINS = (0.1, 0.4)  # diameters: so much of what is around copies is left in scans that are cut out
 _STRANGERS = 3  # that are searched in each image, of twice as many that are nearest in size, by turns
-_KINDS = 100  # more than the families of parts in a folder of world bins
+_BINS = 1000  # more than the families of parts in world bins, or the scenes in a folder
 SEARCHED = 5, _FORMS, _MARGINS, _STRANGERS  # version of what is searched, and from where, and what decides it
 
 
@@ -86,7 +86,6 @@ class Search:
             "largest_error": self.errors(poses, self.image.largest_errors) if is_own else error,
             "object": np.full(len(poses), self.number),
             "search": np.full(len(poses), self.row),
-            "narrowed": np.full(len(poses), self.scene.is_narrowed),
             "T_camera_object": poses,  # to judge it by other evidence
         }
 
@@ -164,8 +163,8 @@ def _asked(image: TrueImage, row: int, is_known: bool) -> Iterator[tuple[Part, F
 
 
 def _images(sources: Sources, network: Model) -> Iterator[_Image]:
-    worlds = [(0, sources.worlds)] if sources.worlds else []
-    worlds += [(1, known) for known in sources.known_worlds]
+    worlds = [(False, sources.worlds)] if sources.worlds else []
+    worlds += [(True, known) for known in sources.known_worlds]
     named = [_name(world) for _, world in worlds]
     if len(set(named)) < len(named):
         raise InputError(f"worlds are told apart by their folders' names, but these are {', '.join(named)}: rename one")
@@ -175,11 +174,13 @@ def _images(sources: Sources, network: Model) -> Iterator[_Image]:
     for number, folder in enumerate(folders, start=1):
         bins = tqdm(bin_images(folder, SPLIT, network, sources.every), unit="image", desc=folder.name)
         for row, image in enumerate(bins):
-            yield _Image(_name(folder), row, 1000 * number + image.key.scene_id, image, _scene_of(image), False)
-    for number, world in worlds:
+            yield _Image(_name(folder), row, _BINS * number + image.key.scene_id, image, _scene_of(image), False)
+    numbers: dict[str, int] = {}  # of families of parts
+    for is_known, world in worlds:
         for row, found in enumerate(tqdm(world_images(world, network), unit="image", desc=f"worlds {world.name}")):
             scene = _scene_of_world(found, row)
-            yield _Image(_name(world), row, _KINDS * number + found.kind, found, scene, number == 1)
+            number = numbers.setdefault(found.kind, len(numbers))
+            yield _Image(_name(world), row, number, found, scene, is_known)
 
 
 def _name(folder: Path) -> str:

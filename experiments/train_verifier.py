@@ -1,7 +1,8 @@
 """Train the pose verifier: `python -m experiments.train_verifier --candidates outputs/poses.npz --every 4 ...`.
 
 It learns which poses are right from those that `python -m experiments.calibrate --candidates FILE` has found in known
-worlds; name FILE, images and worlds as there. How it does on the refined poses of all other images, to which
+worlds, once they are moved onto the depth image, as those that it is shown are; name FILE, images and worlds as there.
+How it does on the refined poses of all other images, to which
 probabilities are fitted, is told, and nothing is chosen by it. Afterwards raise the number of
 `kmn_jax.detection.VERIFIED`, and fit again by the same FILE, whose poses are judged anew.
 """
@@ -30,7 +31,7 @@ from experiments.candidates import read_poses, searches_of
 from experiments.detect_bins import PRECISION, Tally
 from experiments.fits import FitOptions, told, weights_of
 from experiments.searches import Columns, Sources
-from kmn_jax.detection import PICTURE_SIDE, call_rows, verifier_cells
+from kmn_jax.detection import VERIFIER_SIDE, call_rows, polish, verifier_cells
 from kmn_jax.errors import InputError, require
 from kmn_jax.files import write_whole
 from kmn_jax.models import (
@@ -88,14 +89,14 @@ def train_verifier(options: Options) -> dict[str, Any]:
     require(bool(poses["known"].any()), f"{options.candidates} holds no poses of known worlds: see --known-worlds")
     wanted = poses["known"] | poses["due"]
     poses = {name: values[wanted] for name, values in poses.items()}
-    cells = _cells_of(poses, options, network)
-    known = poses["known"]
-    right = (poses["error"] < THRESHOLD).astype(np.float32)
+    cells, errors = _seen(poses, options, network)
+    known = poses["known"] & ~np.isnan(errors)  # what is moved may lie where it is neither right nor wrong
+    right = (errors < THRESHOLD).astype(np.float32)
     weights = weights_of({name: values[known] for name, values in poses.items()}, options).astype(np.float32)
     verifier = fitted(cells[known], right[known], weights, options)
     save_verifier(verifier, options.output)
     log_odds = log_odds_of(verifier, cells)
-    splits = {"known parts": known, "other parts": ~known}
+    splits = {"known parts": known, "other parts": poses["due"]}
     rows = [{"poses of": name} | _judged(log_odds[own], right[own]) for name, own in splits.items() if own.any()]
     print_table("The verifier alone", rows)
     _write_card(options, rows)
@@ -104,17 +105,24 @@ def train_verifier(options: Options) -> dict[str, Any]:
     return results
 
 
-def _cells_of(poses: Columns, options: Options, network: Model) -> Float16[np.ndarray, "p s s c"]:
-    """Return what a verifier sees of each pose."""
-    cells = np.empty((len(poses["error"]), PICTURE_SIDE, PICTURE_SIDE, VERIFIER_CHANNELS), dtype=np.float16)
+def _seen(
+    poses: Columns, options: Options, network: Model
+) -> tuple[Float16[np.ndarray, "p s s c"], Float[np.ndarray, " p"]]:
+    """Return what a verifier sees of each pose, and by how much it is off; those of known parts are polished before."""
+    cells = np.empty((len(poses["error"]), VERIFIER_SIDE, VERIFIER_SIDE, VERIFIER_CHANNELS), dtype=np.float16)
+    errors = poses["error"].copy()
     for search, rows in searches_of(poses, options, network):
-        given = search.on_device.surfels, search.scene.image, search.on_device.arrays.diameter
+        part, image, moved = search.on_device, search.scene.image, poses["T_camera_object"][rows]
+        if search.is_known:
+            moved = polish(moved, part, image)
+            errors[rows] = search.errors(moved, search.image.errors)
+        given = part.surfels, image, part.arrays.diameter
         cells[rows] = call_rows(
             lambda pose, given=given: _cells(pose, *given),
             lambda poses, given=given: _cells_of_many(poses, *given),
-            poses["T_camera_object"][rows],
+            moved,
         )
-    return cells
+    return cells, errors
 
 
 _cells = jax.jit(verifier_cells)

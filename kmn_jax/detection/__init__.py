@@ -15,7 +15,6 @@ from kmn_jax.detection._calibration import (
     load_probabilities,
     probabilities_bytes,
     reliability,
-    vouched,
 )
 from kmn_jax.detection._canonical import canonical_pose
 from kmn_jax.detection._coverage import near_surface
@@ -70,7 +69,8 @@ from kmn_jax.detection._kept_parts import prepare_kept
 from kmn_jax.detection._mapping import call_rows, map_real, map_rows
 from kmn_jax.detection._output import as_json, describe, table, write_bop_csv, write_json
 from kmn_jax.detection._picture_agreement import PictureAgreement, picture_agreement
-from kmn_jax.detection._picture_cells import PICTURE_SIDE, verifier_cells
+from kmn_jax.detection._picture_cells import VERIFIER_SIDE, verifier_cells
+from kmn_jax.detection._polish import polish
 from kmn_jax.detection._result import CropPrediction, Detection, Detections, Pick, Timing, pose_notes, warnings_once
 from kmn_jax.detection._scene import MOST_POINTS, Scene, make_scene
 from kmn_jax.detection._search import (
@@ -99,10 +99,10 @@ __all__ = [
     "MOST_POINTS",
     "NUM_SEEDS",
     "PICTURE_EVIDENCE",
-    "PICTURE_SIDE",
     "THOROUGH",
     "TREE_SETTINGS",
     "VERIFIED",
+    "VERIFIER_SIDE",
     "BinMargins",
     "BinPoses",
     "BinPosesConfig",
@@ -186,6 +186,7 @@ __all__ = [
     "picture_agreement",
     "picture_evidence",
     "placed",
+    "polish",
     "pose_notes",
     "poses_at",
     "poses_in_crop",
@@ -214,7 +215,6 @@ __all__ = [
     "table",
     "verified",
     "verifier_cells",
-    "vouched",
     "warnings_once",
     "with_grasps",
     "write_bop_csv",

@@ -21,7 +21,7 @@ from kmn_jax.detection._draw import CropSearchConfig
 from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
 from kmn_jax.detection._frames import placed
 from kmn_jax.detection._mapping import call_rows
-from kmn_jax.detection._polish import polish_many, polish_one
+from kmn_jax.detection._polish import polish, polish_one
 from kmn_jax.detection._refinement import refine_many, refine_one
 from kmn_jax.detection._result import Detection, Detections
 from kmn_jax.detection._scene import Scene
@@ -149,7 +149,7 @@ def detect(
             rows = np.flatnonzero(choice.kept | choice.contenders)
             found = refined_candidates(on_device, scene, found, rows, random_seed, search)
         with clock("selection"):
-            choice, probability = reported(found, probabilities, on_device, config, scene.is_narrowed)
+            choice, probability = reported(found, probabilities, on_device, config)
     else:
         probability = probabilities.found.probability(found.evidence)
     with clock("report"):
@@ -233,11 +233,7 @@ def refined_candidates(
         seed_keys(seeds, random_seed),
     )
     poses = np.array(poses)
-    poses[there] = call_rows(
-        lambda pose: polish_one(pose, on_device, scene.image),
-        lambda poses: polish_many(poses, on_device, scene.image),
-        poses[there],
-    )
+    poses[there] = polish(poses[there], on_device, scene.image)
     # The refined forms take the place of the poses of their crops.
     forms = there.shape[1]
     own = jax.tree.map(
@@ -300,12 +296,12 @@ def chosen(
 
 
 def reported(
-    refined: Candidates, probabilities: Probabilities, part: DevicePart, config: DetectConfig, is_narrowed: bool
+    refined: Candidates, probabilities: Probabilities, part: DevicePart, config: DetectConfig
 ) -> tuple[Selection, Float[np.ndarray, " s"]]:
     """Choose among refined candidates, and return also how probable those that stand are, given each other."""
     choice = chosen(refined, probabilities.refined, part, config, probabilities.exact)
     probability = np.zeros(len(choice.kept))
-    probability[choice.kept] = probabilities.of_scene(refined.evidence[choice.kept], is_narrowed)
+    probability[choice.kept] = probabilities.of_scene(refined.evidence[choice.kept])
     return choice, probability
 
 

@@ -15,8 +15,8 @@ from kmn_jax.simulate import Surfels
 from kmn_jax.typing import Pose, Scalar
 
 _CELLS = 32  # of the grid, along the longer side of the picture
-_SPARE = 3  # cells beyond it, on each side
-PICTURE_SIDE = _CELLS + 2 * _SPARE
+_SPARE, _WIDE_SPARE = 3, 8  # cells beyond it, on each side, for what is counted and for what a verifier sees
+PICTURE_SIDE, VERIFIER_SIDE = _CELLS + 2 * _SPARE, _CELLS + 2 * _WIDE_SPARE
 _SAMPLES = ((0.0, 0.0), (-0.3, -0.3), (0.3, -0.3), (-0.3, 0.3), (0.3, 0.3))  # places in a cell, in cells
 # Lengths are in diameters of the object.
 LOOSE = 0.04  # between depths
@@ -56,7 +56,7 @@ def verifier_cells(
     T_camera_object: Pose, surfels: Surfels, image: DepthImage, diameter: Scalar
 ) -> Float[Array, "s s c"]:
     """Return what `PoseVerifier` looks at: an object at a pose and a depth image in the same unit, cell by cell."""
-    seen = predicted(T_camera_object, surfels, image)
+    seen = predicted(T_camera_object, surfels, image, VERIFIER_SIDE)
     found = measured(seen, image, diameter)
     mask, there = seen.mask, found.there
     both = mask & there
@@ -65,6 +65,7 @@ def verifier_cells(
     def within(lengths: Float[Array, "s s"], of: Bool[Array, "s s"], most: float) -> Float[Array, "s s"]:
         return jnp.where(of, jnp.clip(lengths / diameter, -most, most), 0)
 
+    toward = -(found.normals * found.points).sum(axis=-1) / jnp.maximum(found.points[..., 2], 1e-6 * diameter)
     channels = (
         mask,
         there,
@@ -75,13 +76,19 @@ def verifier_cells(
         found.has_normal,
         within(found.away, both, _MOST_GAP) / _MOST_GAP,
         within(found.noise, there, _MOST_NOISE) / _MOST_NOISE,
+        jnp.where(found.has_normal, toward, 0),
+        found.in_image,
     )
     assert len(channels) == VERIFIER_CHANNELS
     return jnp.stack([channel.astype(jnp.float32) for channel in channels], axis=-1)
 
 
-def predicted(T_camera_object: Pose, surfels: Surfels, image: DepthImage) -> Predicted:
-    """Return the cells of an object's picture at a pose, as the image's camera would see it alone."""
+def predicted(T_camera_object: Pose, surfels: Surfels, image: DepthImage, side: int = PICTURE_SIDE) -> Predicted:
+    """Return the cells of an object's picture at a pose, as the image's camera would see it alone.
+
+    The grid has `side` cells along each side, of which the picture takes at most 32 in the middle.
+    """
+    spare = (side - _CELLS) // 2
     points = transform_points(T_camera_object, surfels.points)
     normals = jnp.matmul(surfels.normals, T_camera_object[:3, :3].T, precision=_HIGHEST)
     facing = ((points * normals).sum(axis=1) < 0) & (points[:, 2] > 0)
@@ -97,21 +104,19 @@ def predicted(T_camera_object: Pose, surfels: Surfels, image: DepthImage) -> Pre
     spacing = jnp.sqrt(surfels.area / surfels.points.shape[0])
     finest = jnp.maximum(spacing / nearest, 1 / image.camera.fx)
     pitch = jnp.maximum((high - low).max() / (_CELLS - 1), finest)
-    place = jnp.round((directions - low[None]) / pitch).astype(jnp.int32) + _SPARE
-    index = place[:, 1] * PICTURE_SIDE + place[:, 0]
-    front = jnp.full(PICTURE_SIDE**2, jnp.inf).at[jnp.where(facing, index, PICTURE_SIDE**2)].min(z, mode="drop")
+    place = jnp.round((directions - low[None]) / pitch).astype(jnp.int32) + spare
+    index = place[:, 1] * side + place[:, 0]
+    front = jnp.full(side**2, jnp.inf).at[jnp.where(facing, index, side**2)].min(z, mode="drop")
     # The surface of a cell is what lies about as near as its nearest point.
-    shown = facing & (z <= front[jnp.clip(index, 0, PICTURE_SIDE**2 - 1)] + spacing + pitch * nearest)
+    shown = facing & (z <= front[jnp.clip(index, 0, side**2 - 1)] + spacing + pitch * nearest)
     columns = jnp.concatenate([normals, z[:, None], jnp.ones_like(z)[:, None]], axis=1)
-    sums = jnp.zeros((PICTURE_SIDE**2, 5)).at[jnp.where(shown, index, PICTURE_SIDE**2)].add(columns, mode="drop")
-    mask = (sums[:, 4] > 0).reshape(PICTURE_SIDE, PICTURE_SIDE)
+    sums = jnp.zeros((side**2, 5)).at[jnp.where(shown, index, side**2)].add(columns, mode="drop")
+    mask = (sums[:, 4] > 0).reshape(side, side)
     length = jnp.sqrt(jnp.maximum((sums[:, :3] ** 2).sum(axis=1, keepdims=True), 1e-12))
-    steps = (jnp.arange(PICTURE_SIDE, dtype=jnp.float32) - _SPARE) * pitch
+    steps = (jnp.arange(side, dtype=jnp.float32) - spare) * pitch
     u, v = jnp.meshgrid(low[0] + steps, low[1] + steps)
-    depth = (sums[:, 3] / jnp.maximum(sums[:, 4], 1)).reshape(PICTURE_SIDE, PICTURE_SIDE)
-    return Predicted(
-        mask, depth, (sums[:, :3] / length).reshape(PICTURE_SIDE, PICTURE_SIDE, 3), u, v, pitch, nearest, points
-    )
+    depth = (sums[:, 3] / jnp.maximum(sums[:, 4], 1)).reshape(side, side)
+    return Predicted(mask, depth, (sums[:, :3] / length).reshape(side, side, 3), u, v, pitch, nearest, points)
 
 
 def measured(seen: Predicted, image: DepthImage, diameter: Scalar) -> Measured:

@@ -10,10 +10,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float32, Int
 
 from kmn_jax.detection._depth_agreement import DepthImage, measured_at
 from kmn_jax.detection._device_part import DevicePart
+from kmn_jax.detection._mapping import call_rows
 from kmn_jax.geometry import (
     compose,
     from_rotation_translation,
@@ -103,7 +105,13 @@ def polished(pose: Pose, part: DevicePart, image: DepthImage) -> Pose:
 polish_one = kept()(polished)
 
 
-@jax.jit
-def polish_many(poses: Float[Array, "k 4 4"], part: DevicePart, image: DepthImage) -> Float[Array, "k 4 4"]:
-    """Return what `polish_one` does of many poses."""
-    return jax.vmap(polished, in_axes=(0, None, None))(poses, part, image)
+_polish_many = jax.jit(jax.vmap(polished, in_axes=(0, None, None)))
+
+
+def polish(
+    T_camera_object: Float32[np.ndarray, "k 4 4"], part: DevicePart, image: DepthImage
+) -> Float32[np.ndarray, "k 4 4"]:
+    """Return poses as `polished` moves them."""
+    return call_rows(
+        lambda pose: polish_one(pose, part, image), lambda poses: _polish_many(poses, part, image), T_camera_object
+    )

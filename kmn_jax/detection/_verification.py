@@ -21,7 +21,7 @@ from kmn_jax.typing import Pose, Scalar
 
 # The column of the evidence. The number goes up with the weights: a calibration that was fitted to what others say is
 # one of other evidence.
-VERIFIED = "verifier_1"
+VERIFIED = "verifier_2"
 
 
 def verified(

@@ -19,9 +19,9 @@ from kmn_jax.models._layers import dropout
 from kmn_jax.models._weights import PRETRAINED, parameters_bytes, parameters_of
 from kmn_jax.typing import Scalar
 
-VERIFIER_CHANNELS = 9
+VERIFIER_CHANNELS = 11
 VERIFIER = PRETRAINED / "verifier" / "cells.safetensors"  # whose evidence the released calibrations were fitted to
-_WIDTHS, _HIDDEN = (16, 32, 48), 64
+_LAYERS, _HIDDEN = ((32, 2), (32, 1), (64, 2), (96, 2)), 64  # channels and steps of convolutions, then one row
 _DROPOUT = 0.3  # of what is pooled
 _HIGHEST = jax.lax.Precision.HIGHEST
 
@@ -57,20 +57,23 @@ class _Affine(nnx.Module):
 
 
 class PoseVerifier(nnx.Module):
-    """Three convolutions, of which the later two halve the grid, then the mean and the maximum of all cells."""
+    """Four convolutions, of which three halve the grid, then the mean and the maximum of all cells."""
 
     def __init__(self, *, rngs: nnx.Rngs) -> None:
-        first, second, third = _WIDTHS
-        self.first = _Affine((3, 3, VERIFIER_CHANNELS, first), rngs=rngs)
-        self.second = _Affine((3, 3, first, second), 2, rngs=rngs)
-        self.third = _Affine((3, 3, second, third), 2, rngs=rngs)
-        self.hidden = _Affine((2 * third, _HIDDEN), rngs=rngs)
+        widths = VERIFIER_CHANNELS, *(width for width, _ in _LAYERS)
+        self.convolutions = nnx.List(
+            [
+                _Affine((3, 3, before, after), stride, rngs=rngs)
+                for before, (after, stride) in zip(widths, _LAYERS, strict=False)
+            ]
+        )
+        self.hidden = _Affine((2 * widths[-1], _HIDDEN), rngs=rngs)
         self.out = _Affine((_HIDDEN, 1), rngs=rngs)
 
     def __call__(self, cells: Float[Array, "s s c"], key: jax.Array | None = None) -> Scalar:
         """Return the log odds that a pose is right, given the cells of its picture; with a key, there is dropout."""
         x = cells
-        for layer in (self.first, self.second, self.third):
+        for layer in self.convolutions:
             x = jax.nn.relu(layer.of_grid(x))
         pooled = jnp.concatenate([x.mean(axis=(0, 1)), x.max(axis=(0, 1))])
         return self.out.of_row(jax.nn.relu(self.hidden.of_row(dropout(pooled, _DROPOUT, key))))[0]

@@ -20,10 +20,12 @@ from kmn_jax.detection import (
     CalibrationArrays,
     Probabilities,
     chance_calibration_error,
+    company,
     device_calibration,
     expected_calibration_error,
     fit_calibration,
     fit_logistic,
+    keeps_order,
     load_probabilities,
     probabilities_bytes,
     reliability,
@@ -182,20 +184,48 @@ def test_several_members_are_the_mean_of_their_models() -> None:
 
 def test_sure_poses_vouch_for_others_of_their_scene() -> None:
     own = Calibration(("x",), (1.0,), 0.0)
-    models = Probabilities(own, own, own, Calibration(COMPANY, (1.1, 1.15), -4.8))
+    models = Probabilities(own, own, own, Calibration(COMPANY, (1.1, 1.0), -0.5))
     rng = np.random.default_rng(0)
-    assert len(models.of_scene(np.zeros((0, 1)), True)) == 0
+    assert len(models.of_scene(np.zeros((0, 1)))) == 0
     for count in (1, 2, 3, 12):
         evidence = 3 * rng.normal(size=(count, 1))
         alone = own.probability(evidence)
-        np.testing.assert_allclose(models.of_scene(evidence, False), alone, rtol=1e-12)
-        together = models.of_scene(evidence, True)
-        assert (together >= alone).all()
+        together = models.of_scene(evidence)
         assert (np.diff(together[np.argsort(alone, kind="stable")]) >= 0).all()  # the order stays
-    np.testing.assert_allclose(models.of_scene(np.array([[1.2]]), True), own.probability(np.array([[1.2]])), rtol=1e-12)
-    doubtful, with_a_sure_one = np.array([[-1.0], [-2.0]]), np.array([[-1.0], [6.0]])
-    np.testing.assert_allclose(models.of_scene(doubtful, True), own.probability(doubtful), rtol=1e-12)
-    assert models.of_scene(with_a_sure_one, True)[0] > 2 * own.probability(doubtful)[0]
+    lonely = models.of_scene(np.array([[-1.0]]))
+    np.testing.assert_allclose(lonely, 1 / (1 + np.exp(1.6)), rtol=1e-12)
+    doubtful, with_a_sure_one, surer = ([[-1.0], [other]] for other in (-2.0, 4.0, 9.0))
+    np.testing.assert_allclose(models.of_scene(np.array(doubtful))[0], lonely[0], rtol=1e-12)
+    assert models.of_scene(np.array(with_a_sure_one))[0] > 2 * lonely[0]
+    assert models.of_scene(np.array(surer))[0] == models.of_scene(np.array(with_a_sure_one))[0]
+
+
+def test_the_other_one_is_the_most_probable_of_the_rest() -> None:
+    np.testing.assert_array_equal(company(np.array([2.0, 7.0, 3.0, -1.0]))[:, 1], [4, 3, 4, 4])
+    np.testing.assert_array_equal(company(np.array([3.0, 3.0]))[:, 1], [3, 3])
+    np.testing.assert_array_equal(company(np.array([-2.0, 1.0])), [[-2, 1], [1, 0]])
+    np.testing.assert_array_equal(company(np.array([5.0])), [[5, 0]])
+    assert company(np.zeros(0)).shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    "weights, keeps",
+    [
+        ((1.0, 0.9), True),
+        ((1.0, -2.0), True),
+        ((1.0, 1.0), False),
+        ((0.0, -1.0), False),
+        ((1.0, 1.1), False),
+        ((), False),
+    ],
+)
+def test_models_that_change_the_order_of_poses_are_told(weights: tuple[float, ...], keeps: bool) -> None:
+    model = Calibration(COMPANY, weights, 0.3)
+    assert keeps_order(model) == keeps
+    if len(weights) == 2:
+        pairs = np.sort(np.random.default_rng(0).uniform(-6, 8, (500, 2)), axis=1)
+        stays = [np.diff(model.logit(company(pair)))[0] > 0 for pair in pairs]
+        assert all(stays) == keeps
 
 
 def test_reliability_counts_every_pose_once() -> None:
@@ -224,7 +254,7 @@ def test_what_counts_twice_is_as_if_it_was_there_twice() -> None:
 def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.calibration.json"
     logistic = Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25)
-    together = Calibration(COMPANY, (1.1, 1.2), -4.8)
+    together = Calibration(COMPANY, (1.1, 0.7), -0.4)
     fitted = Probabilities(logistic, fit_calibration(*drawn(200), NAMES), logistic, together)
     path.write_bytes(probabilities_bytes(fitted))
     loaded = load_probabilities(path, NAMES)

@@ -13,6 +13,7 @@ import pytest
 from kmn_jax.detection import (
     EVIDENCE,
     VERIFIED,
+    VERIFIER_SIDE,
     CropSearchConfig,
     DepthImage,
     DevicePart,
@@ -37,7 +38,7 @@ from tests.reference.meshes import pose
 
 PART, VIEW = box_part(), box_view()
 SURFELS = Surfels(jnp.asarray(PART.points), jnp.asarray(PART.normals), jnp.float32(PART.area))
-MASK, THERE, GAP, OWN, OTHER, COSINE, HAS_NORMAL, AWAY, NOISE = range(VERIFIER_CHANNELS)
+MASK, THERE, GAP, OWN, OTHER, COSINE, HAS_NORMAL, AWAY, NOISE, TOWARD, IN_IMAGE = range(VERIFIER_CHANNELS)
 see = jax.jit(verifier_cells)
 
 
@@ -45,14 +46,18 @@ def cells_of(T: np.ndarray, depth: np.ndarray | None = None, diameter: float = P
     image = DepthImage(jnp.asarray(VIEW.depth if depth is None else depth), intrinsics(CAMERA))
     cells = np.asarray(see(jnp.asarray(T, dtype=jnp.float32), SURFELS, image, jnp.float32(diameter)))
     assert np.isfinite(cells).all()
-    assert np.abs(cells).max() <= 1
+    assert np.abs(np.delete(cells, TOWARD, axis=-1)).max() <= 1
     return cells
 
 
 def test_at_the_right_pose_the_cells_agree() -> None:
     cells = cells_of(POSES[0])
     mask = cells[..., MASK] > 0
-    assert 0.1 < mask.mean() < 0.8
+    assert mask.shape == (VERIFIER_SIDE, VERIFIER_SIDE)
+    assert 0.05 < mask.mean() < 0.5
+    taken = np.argwhere(mask)
+    assert (taken.min(axis=0) == 8).all()  # so many cells are beyond the outline
+    assert taken.max() < VERIFIER_SIDE - 8
     inside = mask & (cells[..., COSINE] > 0)
     assert np.abs(cells[..., GAP][inside]).mean() < 0.1  # in 6% of the diameter
     np.testing.assert_allclose(cells[..., OWN][mask].mean(), 0, atol=1e-5)
@@ -66,6 +71,23 @@ def test_at_the_right_pose_the_cells_agree() -> None:
     )
     near = (cells[..., AWAY] < 0.02 / 0.06) & (cells[..., THERE] > 0)
     assert (near & mask).sum() / mask.sum() == pytest.approx(float(agreement.near))
+
+
+def test_what_is_beyond_the_outline_is_seen_up_to_the_edge_of_the_image() -> None:
+    """A camera looks down onto a floor of which the left half of the image is not there."""
+    camera = intrinsics(CAMERA)
+    T = pose((0.0, 0.0, 3.0))
+    depth = np.full(VIEW.depth.shape, 3.0 * PART.diameter, dtype=np.float32)
+    whole = cells_of(T, depth)
+    assert (whole[..., IN_IMAGE] == whole[..., THERE]).all()
+    seen = whole[..., HAS_NORMAL] == 1
+    assert seen.mean() > 0.5
+    np.testing.assert_allclose(whole[..., TOWARD][seen], 1, atol=1e-3)  # the floor faces the camera
+    depth[:, : int(camera.cx)] = 0
+    half = cells_of(T, depth)
+    assert (half[..., IN_IMAGE] == whole[..., IN_IMAGE]).all()
+    assert 0.3 < half[..., THERE].sum() / whole[..., THERE].sum() < 0.7
+    assert (half[..., TOWARD][half[..., THERE] == 0] == 0).all()
 
 
 def test_farther_and_nearer_are_told_apart() -> None:
@@ -124,7 +146,7 @@ def test_refined_poses_alone_are_shown_to_it(monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(detecting, "call_rows", rows)
     monkeypatch.setattr(detecting, "refine_many", refined)
-    monkeypatch.setattr(detecting, "polish_many", lambda poses, part, image: poses)
+    monkeypatch.setattr(detecting, "polish", lambda poses, part, image: poses)
     monkeypatch.setattr(detecting, "verified", said)
     config = SearchConfig(CropSearchConfig(num_points=64, num_draws=1))
     none = no_poses(config.crops, 8)

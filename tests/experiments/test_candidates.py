@@ -92,7 +92,6 @@ def store(path: Path, network: Model, names: tuple[str, ...] = EVIDENCE, **other
         "object": np.array([7, 7, 7, 7, 8, 8]),
         "search": np.array([0, 0, 0, 0, 1, 1]),
         "known": np.zeros(6, dtype=bool),
-        "narrowed": np.zeros(6, dtype=bool),
         "T_camera_object": poses,
         "refined": np.array([False, True, True, True, True, True]),
         "due": np.array([False, True, True, True, False, False]),

@@ -75,7 +75,7 @@ class Asked:
 
             def columns(found: Any, row: int = row, own: int = own) -> dict[str, np.ndarray]:
                 count = int(found.usable.sum())
-                numbers = {"object": 7 + own, "search": row, "error": 0.01, "largest_error": 0.01, "narrowed": False}
+                numbers = {"object": 7 + own, "search": row, "error": 0.01, "largest_error": 0.01}
                 rows = {name: np.full(count, value) for name, value in numbers.items()}
                 poses = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1))
                 return rows | {"evidence": np.full((count, len(EVIDENCE)), found.evidence[0]), "T_camera_object": poses}

@@ -23,13 +23,13 @@ def part(name: str) -> Any:
     return SimpleNamespace(name=name, points=box_cloud(0, 256, (4.0, 2.0, 1.0))[:, :3], diameter=4.5)
 
 
-def world(strangers: str = "", copies: int = 1) -> WorldImage:
+def world(strangers: str = "", copies: int = 1, kind: str = "cup") -> WorldImage:
     """Make the image of a floor, with copies in the middle of it or none."""
     grid = np.stack(np.meshgrid(*[np.linspace(-20, 20, 161)] * 2, [0.0]), axis=-1).reshape(-1, 3)
     scan = Scan(grid, None, None, None, "mm")
     truth = np.tile(np.eye(4), (copies, 1, 1))
     return WorldImage(
-        FrameKey(3, 1), part("own"), tuple(map(part, strangers)), truth, np.ones(copies), "table", 2, scan
+        FrameKey(3, 1), part("own"), tuple(map(part, strangers)), truth, np.ones(copies), "table", kind, scan
     )
 
 
@@ -127,14 +127,18 @@ def test_known_worlds_come_last_and_share_the_numbers_of_their_families(
     (tmp_path / "bins" / "a" / module.SPLIT).mkdir(parents=True)
     image = SimpleNamespace(key=FrameKey(5, 0), scene=None)
     monkeypatch.setattr(module, "bin_images", lambda *given: [image])
-    monkeypatch.setattr(module, "world_images", lambda folder, network: [world(), world()])
+    images = {"validation": ["mug", "nut"], "b": ["cup", "clip"], "a": ["clip", "cup"]}
+    monkeypatch.setattr(
+        module, "world_images", lambda folder, network: [world(kind=kind) for kind in images[folder.name]]
+    )
     folders = tmp_path / "worlds" / "validation", tmp_path / "worlds" / "b", tmp_path / "worlds" / "a"
     sources, nothing = Sources(bins=tmp_path / "bins", worlds=folders[0], known_worlds=folders[1:]), cast(Any, None)
+    numbers = {"b": (2, 3), "a": (3, 2)}
     found = [(one.folder, one.row, one.number, one.is_known) for one in module._images(sources, nothing)]
     assert found == [
         ("bins-a", 0, 1005, False),
-        *(("worlds-validation", row, 2, False) for row in range(2)),
-        *((f"worlds-{name}", row, 102, True) for name in "ba" for row in range(2)),
+        *(("worlds-validation", row, row, False) for row in range(2)),
+        *((f"worlds-{name}", row, number, True) for name in "ba" for row, number in enumerate(numbers[name])),
     ]
     twice = replace(sources, known_worlds=(tmp_path / "worlds" / "validation",))
     with pytest.raises(InputError, match="these are worlds-validation, worlds-validation: rename one"):

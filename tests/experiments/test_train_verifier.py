@@ -86,6 +86,9 @@ def test_known_parts_are_learned_from_and_others_told_of(tmp_path: Path, monkeyp
         "row": np.arange(80),
     }
     poses["error"][5] = np.nan  # neither right nor wrong
+    seen_errors = poses["error"].copy()
+    seen_errors[7] = np.nan  # the same, once it is moved
+    seen_errors[8] = np.inf if right[8] else 0.0  # another outcome
     asked: list[Any] = []
 
     def fit(cells: np.ndarray, right: np.ndarray, weights: np.ndarray, options: Options) -> Any:
@@ -93,17 +96,20 @@ def test_known_parts_are_learned_from_and_others_told_of(tmp_path: Path, monkeyp
         return module.create_verifier(jax.random.key(0))
 
     monkeypatch.setattr(module, "read_poses", lambda *given: (dict(poses), ("a column",), ("a column",)))
-    monkeypatch.setattr(module, "_cells_of", lambda poses, options, network: cells[poses["row"]])
+    monkeypatch.setattr(
+        module, "_seen", lambda poses, options, network: (cells[poses["row"]], seen_errors[poses["row"]])
+    )
     monkeypatch.setattr(module, "fitted", fit)
     given = options(tmp_path, json=tmp_path / "told.json")
     result = train_verifier(given)
     ((seen, labels, weights),) = asked
-    rows = np.delete(np.arange(60), 5)
+    rows = np.delete(np.arange(60), [5, 7])
     np.testing.assert_array_equal(seen, cells[rows])
-    np.testing.assert_array_equal(labels, right[rows])
+    np.testing.assert_array_equal(labels, seen_errors[rows] < module.THRESHOLD)
+    assert labels[6] != (poses["error"][8] < module.THRESHOLD)
     np.testing.assert_allclose(weights.mean(), 1, rtol=1e-6)
-    np.testing.assert_allclose(weights[-1] / weights[0], (39 / 20) ** 0.5, rtol=1e-6)
-    assert [(row["poses of"], row["poses"]) for row in result["verifier"]] == [("known parts", 59), ("other parts", 5)]
+    np.testing.assert_allclose(weights[-1] / weights[0], (38 / 20) ** 0.5, rtol=1e-6)
+    assert [(row["poses of"], row["poses"]) for row in result["verifier"]] == [("known parts", 58), ("other parts", 5)]
     assert load_verifier(given.output)
     assert markdown_table(result["verifier"]) in given.output.with_suffix(".md").read_text(encoding="utf-8")
     assert (tmp_path / "told.json").exists()
@@ -115,24 +121,36 @@ def test_known_parts_are_learned_from_and_others_told_of(tmp_path: Path, monkeyp
 def test_each_pose_has_the_cells_of_its_own_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     part = SimpleNamespace(surfels=1.0, arrays=SimpleNamespace(diameter=2.0))
 
-    def searched(poses: Any, options: Options, network: Any) -> Any:
+    def errors(poses: np.ndarray, of: str) -> np.ndarray:
+        assert of == "errors"
+        return poses[:, 0, 3] / 100
+
+    def searched(poses: Any, options: Any, network: Any) -> Any:
         for row in (1, 0):
-            search = SimpleNamespace(on_device=part, scene=SimpleNamespace(image=10.0 * row))
-            yield search, np.flatnonzero(poses["search"] == row)
+            scene, image = SimpleNamespace(image=10.0 * row), SimpleNamespace(errors="errors")
+            facts = {"on_device": part, "scene": scene, "image": image, "errors": errors, "is_known": row == 1}
+            yield SimpleNamespace(**facts), np.flatnonzero(poses["search"] == row)
 
     def cells(pose: np.ndarray, surfels: float, image: float, diameter: float) -> np.ndarray:
-        shape = (module.PICTURE_SIDE, module.PICTURE_SIDE, VERIFIER_CHANNELS)
+        shape = (module.VERIFIER_SIDE, module.VERIFIER_SIDE, VERIFIER_CHANNELS)
         return np.full(shape, pose[0, 3] + image + surfels * diameter)
+
+    def moved(poses: np.ndarray, on_device: Any, image: float) -> np.ndarray:
+        assert (on_device, image) == (part, 10.0)
+        return poses + 0.5
 
     monkeypatch.setattr(module, "searches_of", searched)
     monkeypatch.setattr(module, "_cells", cells)
+    monkeypatch.setattr(module, "polish", moved)
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, 0, 3] = np.arange(4)
-    stored = {"error": np.zeros(4), "search": np.array([0, 1, 0, 1]), "T_camera_object": poses}
+    stored = {"error": np.full(4, 0.2), "search": np.array([0, 1, 0, 1]), "T_camera_object": poses}
     nothing: Any = None
-    found = module._cells_of(stored, options(tmp_path), nothing)
+    found, off = module._seen(stored, options(tmp_path), nothing)
     assert found.dtype == np.float16
-    np.testing.assert_array_equal(found[:, 3, 5, 2], [2, 13, 4, 15])
+    np.testing.assert_array_equal(found[:, 3, 5, 2], [2, 13.5, 4, 15.5])
+    np.testing.assert_allclose(off, [0.2, 0.015, 0.2, 0.035])
+    np.testing.assert_array_equal(stored["T_camera_object"][:, 0, 3], np.arange(4))
 
 
 def test_what_cannot_be_trained_is_refused(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from kmn_jax.models import (
     verify,
 )
 
-CELLS = jax.random.normal(jax.random.key(1), (38, 38, VERIFIER_CHANNELS))
+CELLS = jax.random.normal(jax.random.key(1), (48, 48, VERIFIER_CHANNELS))
 
 
 @pytest.fixture(scope="module")
