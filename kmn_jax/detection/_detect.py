@@ -298,11 +298,14 @@ def chosen(
 def reported(
     refined: Candidates, probabilities: Probabilities, part: DevicePart, config: DetectConfig
 ) -> tuple[Selection, Float[np.ndarray, " s"]]:
-    """Choose among refined candidates, and return also how probable those that stand are, given each other."""
+    """Choose among refined candidates, and return also how probable those that stand are, given each other.
+
+    Those that stand by what speaks for each alone, but are too improbable beside the others, are not kept.
+    """
     choice = chosen(refined, probabilities.refined, part, config, probabilities.exact)
     probability = np.zeros(len(choice.kept))
     probability[choice.kept] = probabilities.of_scene(refined.evidence[choice.kept])
-    return choice, probability
+    return choice._replace(kept=choice.kept & (probability >= config.reported)), probability
 
 
 def detections(

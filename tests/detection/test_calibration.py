@@ -209,7 +209,7 @@ def test_the_other_one_is_the_most_probable_of_the_rest() -> None:
 
 
 @pytest.mark.parametrize(
-    "weights, keeps",
+    ("weights", "keeps"),
     [
         ((1.0, 0.9), True),
         ((1.0, -2.0), True),
