@@ -49,7 +49,7 @@ _COLUMNS = (  # of what is stored
     "largest_error",
     "object",
     "search",
-    "known",  # whether the network, and the verifier, were trained with such parts
+    "known",  # whether the network, or the verifier, was trained with such parts
     "T_camera_object",
     "refined",
     "due",  # whether they are of what detection chooses among, which refines less

@@ -124,6 +124,7 @@ def fit(poses: dict[str, np.ndarray], options: FitOptions) -> Fitted:
 def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: FitOptions) -> Fitted:
     """Fit the model of what reported poses of one search say about each other, given the log odds of each.
 
+    What is judged are those that are probable enough beside the others to be listed.
     Raises InputError if of two of one search the surer one would become the less probable one.
     """
     logits, poses = logits[poses["reported"]], _reported(poses)
@@ -145,7 +146,10 @@ def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], 
     for names in _folds(poses, options):
         own = np.isin(poses["object"], names)
         held_out[own] = of_company(~own).logit(columns[own])
-    return Fitted(of_company(np.ones(len(right), dtype=bool)), held_out, _judged(poses, held_out, counts))
+    listed = 1 / (1 + np.exp(-held_out)) >= DetectConfig().reported
+    told_of = {name: values[listed] for name, values in poses.items()}
+    results = _judged(told_of, held_out[listed], counts[listed])
+    return Fitted(of_company(np.ones(len(right), dtype=bool)), held_out, results)
 
 
 def _reported(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from experiments.bins import BinImage, TrueImage, WorldImage, bin_images, world_images
 from experiments.test_sets import SPLIT
+from experiments.training_parts import larger_piece
 from kmn_jax.detection import Candidates, DevicePart, Scene, device_part, make_scene
 from kmn_jax.errors import InputError
 from kmn_jax.io import Scan
@@ -27,7 +28,7 @@ Form = Literal["image", "cloud", "cut-out"]  # what users may have: depth images
 _FORMS: tuple[Form, ...] = get_args(Form)
 _MARGINS = (0.1, 0.4)  # diameters: so much of what is around copies is left in scans that are cut out
 _STRANGERS = 3  # that are searched in each image, of twice as many that are nearest in size, by turns
-_BINS = 1000  # more than the families of parts in world bins, or the scenes in a folder
+_MOST = 1000  # families of parts in world bins, or scenes in a folder
 SEARCHED = 5, _FORMS, _MARGINS, _STRANGERS  # version of what is searched, and from where, and what decides it
 
 
@@ -38,7 +39,7 @@ class Sources:
     method: Literal["kmn_jax", "FPFH"] = "kmn_jax"
     bins: Path = Path("outputs/validation_bins")  # folder with datasets in BOP format
     worlds: Path | None = None  # folder of world bins to fit on, too: outputs/worlds/validation
-    known_worlds: tuple[Path, ...] = ()  # the same, of families of parts that the network was trained with
+    known_worlds: tuple[Path, ...] = ()  # the same, of families of parts that the network, or the verifier, knows
     every: int = 1  # use every so many images of `bins`
     judge_anew: bool = False  # compute what depth images show of stored poses again, as after a change of that code
 
@@ -53,7 +54,7 @@ class Search:
     make_scene: Callable[[], Scene]  # raises InputError if there is nothing to search, as on an empty table
     row: int  # of all searches
     number: int  # that searches of one object, or of one family of parts, share
-    is_known: bool  # whether the network was trained with such parts
+    is_known: bool  # whether the network, or the verifier, was trained with such parts
     name: str  # of its own, whatever else is searched
 
     @cached_property
@@ -174,12 +175,12 @@ def _images(sources: Sources, network: Model) -> Iterator[_Image]:
     for number, folder in enumerate(folders, start=1):
         bins = tqdm(bin_images(folder, SPLIT, network, sources.every), unit="image", desc=folder.name)
         for row, image in enumerate(bins):
-            yield _Image(_name(folder), row, _BINS * number + image.key.scene_id, image, _scene_of(image), False)
+            yield _Image(_name(folder), row, _MOST * number + image.key.scene_id, image, _scene_of(image), False)
     numbers: dict[str, int] = {}  # of families of parts
     for is_known, world in worlds:
         for row, found in enumerate(tqdm(world_images(world, network), unit="image", desc=f"worlds {world.name}")):
             scene = _scene_of_world(found, row)
-            number = numbers.setdefault(found.kind, len(numbers))
+            number = numbers.setdefault(larger_piece(found.kind), len(numbers))
             yield _Image(_name(world), row, number, found, scene, is_known)
 
 

@@ -92,8 +92,9 @@ def train_verifier(options: Options) -> dict[str, Any]:
     cells, errors = _seen(poses, options, network)
     known = poses["known"] & ~np.isnan(errors)  # what is moved may lie where it is neither right nor wrong
     right = (errors < THRESHOLD).astype(np.float32)
-    weights = weights_of({name: values[known] for name, values in poses.items()}, options).astype(np.float32)
-    verifier = fitted(cells[known], right[known], weights, options)
+    weights = np.zeros(len(known), dtype=np.float32)
+    weights[known] = weights_of({name: values[known] for name, values in poses.items()}, options)
+    verifier = fitted(cells, right, weights, options)
     save_verifier(verifier, options.output)
     log_odds = log_odds_of(verifier, cells)
     splits = {"known parts": known, "other parts": poses["due"]}
@@ -135,26 +136,27 @@ def fitted(
     weights: Float[np.ndarray, " p"],
     options: Options,
 ) -> Verifier:
-    """Return a verifier that is trained with poses, of which each counts as much as its weight."""
-    require(len(cells) >= options.batch, f"{len(cells)} poses are less than a batch of {options.batch}")
+    """Return a verifier that is trained with poses, of which each counts as much as its weight, if it has any."""
+    chosen = np.flatnonzero(weights)
+    require(len(chosen) >= options.batch, f"{len(chosen)} poses are less than a batch of {options.batch}")
     key = jax.random.key(options.random_seed)
     graphdef, parameters = create_verifier(key)
-    steps = options.epochs * (len(cells) // options.batch)
+    steps = options.epochs * (len(chosen) // options.batch)
     optimizer = OptimizerConfig(
         "adamw", "cosine", options.learning_rate, _LEAST_RATE, steps // 4, weight_decay=options.weight_decay
     ).build(steps)
     state = State(parameters, optimizer.init(parameters), jnp.int32(0))
-    for rows in tqdm(_batches(len(cells), options), total=steps, desc="verifier", unit="step"):
+    for rows in tqdm(_batches(chosen, options), total=steps, desc="verifier", unit="step"):
         batch = jax.device_put((cells[rows].astype(np.float32), right[rows], weights[rows]))
         state = _train_step(graphdef, optimizer, state, *batch, key)
     return Verifier(graphdef, state.parameters)
 
 
-def _batches(count: int, options: Options) -> Iterator[Int[np.ndarray, " b"]]:
+def _batches(rows: Int[np.ndarray, " p"], options: Options) -> Iterator[Int[np.ndarray, " b"]]:
     """Yield the rows of batches: in each epoch all, in another order, but for what fills no batch."""
-    rng = np.random.default_rng(options.random_seed)
+    rng, count = np.random.default_rng(options.random_seed), len(rows)
     for _ in range(options.epochs):
-        order = rng.permutation(count)
+        order = rows[rng.permutation(count)]
         yield from order[: count - count % options.batch].reshape(-1, options.batch)
 
 
@@ -215,7 +217,8 @@ Made by `experiments/train_verifier.py`; change that, not this file.
 
 - **Weights**: `{options.output.name}`, SHA-256 `{digest[:16]}…`; `kmn_jax.models.load_verifier` loads them. What they
   say of refined poses is one column of the evidence that probabilities are fitted to.
-- **Data**: poses as they are found in known worlds (docs/data.md); {options.epochs} epochs, batches of {options.batch}.
+- **Data**: poses as they are found in known worlds (docs/data.md), moved onto the depth image; {options.epochs} epochs,
+  batches of {options.batch}.
 - **Command**: `{facts["command"]}`, commit {facts["commit"]}.
 
 Of poses by what it says alone; "other parts" are refined poses such as detection chooses among, of images and parts

@@ -1,5 +1,7 @@
 """CAD parts made by parameters, to train on beside the electronic components, which are hardly ever thin or hollow.
 
+Compounds of two of them are for the pose verifier alone, see `experiments.worlds`.
+
 No family is one of those that world bins for validation or test are made of (`experiments.parametric_parts`). Lengths
 are in millimetres.
 """
@@ -215,15 +217,16 @@ def compound(first: str, second: str, rng: np.random.Generator) -> Solid:
     Parts with one `first` share most of their surface, so that only what is beyond it tells one from the other.
     """
     base = TRAINING_FAMILIES[first](np.random.default_rng((PARTS_SEED, list(TRAINING_FAMILIES).index(first))))
+    size = _diagonal(base[0])
     vertices, triangles = TRAINING_FAMILIES[second](rng)
-    vertices = vertices * rng.uniform(0.35, 0.8) * _diagonal(base[0]) / _diagonal(vertices)
+    vertices = vertices * rng.uniform(0.35, 0.8) * size / _diagonal(vertices)
     place, outwards = _place_on(base, rng)
     turns = rng.permutation(np.array(list(np.ndindex(4, 4, 4))))
     root, along = _place_on((vertices, triangles), rng)
-    turned = [_turned(np.stack([root, along, *vertices]), turn) for turn in turns]
-    best = min(turned, key=lambda rows: round(float(rows[1] @ outwards), 6))  # of those that are equal the first
-    sunk = 0.04 * _diagonal(base[0])
-    joined, faces = union(base, (best[2:] - best[0] + place - sunk * outwards, triangles))
+    cosines = [round(float(_turned(along[None], turn)[0] @ outwards), 6) for turn in turns]
+    turn = turns[int(np.argmin(cosines))]  # of those that lay it onto the side the first
+    sunk = place - 0.04 * size * outwards
+    joined, faces = union(base, (_turned(vertices - root, turn) + sunk, triangles))
     return joined * rng.uniform(30, 110) / np.ptp(joined, axis=0).max(), faces
 
 
@@ -247,8 +250,16 @@ def _turned(points: Float[np.ndarray, "v 3"], quarters: Int[np.ndarray, " 3"]) -
     return points
 
 
+_WITH = "_with_"
+
+
+def larger_piece(family: str) -> str:
+    """Return of a family of compounds that of its larger piece, of another family itself."""
+    return family.partition(_WITH)[0]
+
+
 COMPOUNDS: Mapping[str, Callable[[np.random.Generator], Solid]] = {
-    f"{first}_with_{second}": partial(compound, first, second)
+    f"{first}{_WITH}{second}": partial(compound, first, second)
     for row, first in enumerate(TRAINING_FAMILIES)
     for second in (list(TRAINING_FAMILIES)[(row + step) % len(TRAINING_FAMILIES)] for step in _SECONDS)
 }

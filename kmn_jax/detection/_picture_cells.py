@@ -65,7 +65,7 @@ def verifier_cells(
     def within(lengths: Float[Array, "s s"], of: Bool[Array, "s s"], most: float) -> Float[Array, "s s"]:
         return jnp.where(of, jnp.clip(lengths / diameter, -most, most), 0)
 
-    toward = -(found.normals * found.points).sum(axis=-1) / jnp.maximum(found.points[..., 2], 1e-6 * diameter)
+    ways = jnp.stack([seen.u, seen.v, jnp.ones_like(seen.u)], axis=-1)
     channels = (
         mask,
         there,
@@ -76,7 +76,7 @@ def verifier_cells(
         found.has_normal,
         within(found.away, both, _MOST_GAP) / _MOST_GAP,
         within(found.noise, there, _MOST_NOISE) / _MOST_NOISE,
-        jnp.where(found.has_normal, toward, 0),
+        jnp.where(found.has_normal, -(found.normals * ways).sum(axis=-1), 0),  # of what faces the image's plane 1
         found.in_image,
     )
     assert len(channels) == VERIFIER_CHANNELS

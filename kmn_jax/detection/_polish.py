@@ -112,6 +112,8 @@ def polish(
     T_camera_object: Float32[np.ndarray, "k 4 4"], part: DevicePart, image: DepthImage
 ) -> Float32[np.ndarray, "k 4 4"]:
     """Return poses as `polished` moves them."""
+    if not len(T_camera_object):
+        return T_camera_object
     return call_rows(
         lambda pose: polish_one(pose, part, image), lambda poses: _polish_many(poses, part, image), T_camera_object
     )

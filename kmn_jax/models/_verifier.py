@@ -6,6 +6,7 @@ sensor and network. What it says is one column of evidence among others: how pro
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -63,8 +64,8 @@ class PoseVerifier(nnx.Module):
         widths = VERIFIER_CHANNELS, *(width for width, _ in _LAYERS)
         self.convolutions = nnx.List(
             [
-                _Affine((3, 3, before, after), stride, rngs=rngs)
-                for before, (after, stride) in zip(widths, _LAYERS, strict=False)
+                _Affine((3, 3, *pair), stride, rngs=rngs)
+                for pair, (_, stride) in zip(pairwise(widths), _LAYERS, strict=True)
             ]
         )
         self.hidden = _Affine((2 * widths[-1], _HIDDEN), rngs=rngs)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from experiments.solids import box, union
 from kmn_jax.detection import DepthAgreementConfig, DevicePart, Scene, make_scene, symmetry_transforms
 from kmn_jax.detection._look_alikes import MOST, look_alikes
-from kmn_jax.detection._polish import polished
+from kmn_jax.detection._polish import _polish_many, polish, polished
 from kmn_jax.detection._refinement import refined_forms
 from kmn_jax.geometry import Camera, SmoothConfig, crop_around, measured_points
 from kmn_jax.io import Scan
@@ -216,6 +216,16 @@ def test_polishing_leaves_what_nothing_was_measured_of(part: Part, scene: Scene)
     for pose_, depth in ((start, 0 * scene.image.depth), (behind, scene.image.depth), (elsewhere, scene.image.depth)):
         found = POLISHED(jnp.asarray(pose_), on_device, scene.image._replace(depth=depth))
         np.testing.assert_array_equal(found, pose_)
+
+
+def test_many_are_polished_as_each_is(part: Part, scene: Scene) -> None:
+    on_device = device_of(part, np.zeros(MOST, dtype=bool))
+    starts = np.stack([moved(TRUE, seed, 2.0, 0.015 * part.diameter) for seed in range(3)])
+    found, many = polish(starts, on_device, scene.image), _polish_many(starts, on_device, scene.image)
+    wanted = [POLISHED(jnp.asarray(start), on_device, scene.image) for start in starts]
+    for result in (found, many):
+        np.testing.assert_allclose(result, wanted, atol=1e-4 * part.diameter)
+    assert polish(starts[:0], on_device, scene.image).shape == (0, 4, 4)
 
 
 def test_polishing_does_not_slide_a_plate_along_itself() -> None:

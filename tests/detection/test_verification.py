@@ -75,7 +75,6 @@ def test_at_the_right_pose_the_cells_agree() -> None:
 
 def test_what_is_beyond_the_outline_is_seen_up_to_the_edge_of_the_image() -> None:
     """A camera looks down onto a floor of which the left half of the image is not there."""
-    camera = intrinsics(CAMERA)
     T = pose((0.0, 0.0, 3.0))
     depth = np.full(VIEW.depth.shape, 3.0 * PART.diameter, dtype=np.float32)
     whole = cells_of(T, depth)
@@ -83,11 +82,17 @@ def test_what_is_beyond_the_outline_is_seen_up_to_the_edge_of_the_image() -> Non
     seen = whole[..., HAS_NORMAL] == 1
     assert seen.mean() > 0.5
     np.testing.assert_allclose(whole[..., TOWARD][seen], 1, atol=1e-3)  # the floor faces the camera
-    depth[:, : int(camera.cx)] = 0
+    depth[:, : int(CAMERA.cx)] = 0
     half = cells_of(T, depth)
     assert (half[..., IN_IMAGE] == whole[..., IN_IMAGE]).all()
     assert 0.3 < half[..., THERE].sum() / whole[..., THERE].sum() < 0.7
     assert (half[..., TOWARD][half[..., THERE] == 0] == 0).all()
+    aside = cells_of(pose((-1.4, 0.0, 3.0)), np.full_like(depth, 3.0 * PART.diameter))  # of half a width at the left
+    beyond = aside[..., IN_IMAGE] == 0
+    assert 0.05 < beyond.mean() < 0.9
+    assert beyond[:, 0].all()
+    assert not beyond[8, 24:].any()
+    assert (aside[..., THERE] == 1 - beyond).all()
 
 
 def test_farther_and_nearer_are_told_apart() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.parametric_parts import FAMILIES, TEST_FAMILIES, VALIDATION_FAMILIES, write_parts
-from experiments.training_parts import COMPOUNDS, TRAINING_FAMILIES
+from experiments.training_parts import COMPOUNDS, TRAINING_FAMILIES, larger_piece
 from kmn_jax.objects import load_object
 from kmn_jax.simulate import collision_shape
 
@@ -45,8 +45,9 @@ def test_no_family_is_in_two_sets() -> None:
 
 def test_compounds_share_one_piece_and_differ_in_the_other() -> None:
     name = next(iter(COMPOUNDS))
-    first, _ = name.split("_with_")
-    assert sum(other.startswith(f"{first}_with_") for other in COMPOUNDS) == 4
+    first = larger_piece(name)
+    assert sum(larger_piece(other) == first for other in COMPOUNDS) == 4
+    assert {larger_piece(other) for other in COMPOUNDS} == set(TRAINING_FAMILIES)
     shapes = [COMPOUNDS[name](np.random.default_rng(number))[0] for number in range(2)]
     base = len(TRAINING_FAMILIES[first](np.random.default_rng(0))[0])  # of a channel, which always has as many corners
     own, other = (np.linalg.norm(np.diff(shape[:base], axis=0), axis=1) for shape in shapes)

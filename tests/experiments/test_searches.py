@@ -127,13 +127,13 @@ def test_known_worlds_come_last_and_share_the_numbers_of_their_families(
     (tmp_path / "bins" / "a" / module.SPLIT).mkdir(parents=True)
     image = SimpleNamespace(key=FrameKey(5, 0), scene=None)
     monkeypatch.setattr(module, "bin_images", lambda *given: [image])
-    images = {"validation": ["mug", "nut"], "b": ["cup", "clip"], "a": ["clip", "cup"]}
+    images = {"validation": ["mug", "nut"], "b": ["cup", "clip"], "a": ["clip_with_cup", "cup_with_clip", "hook"]}
     monkeypatch.setattr(
         module, "world_images", lambda folder, network: [world(kind=kind) for kind in images[folder.name]]
     )
     folders = tmp_path / "worlds" / "validation", tmp_path / "worlds" / "b", tmp_path / "worlds" / "a"
     sources, nothing = Sources(bins=tmp_path / "bins", worlds=folders[0], known_worlds=folders[1:]), cast(Any, None)
-    numbers = {"b": (2, 3), "a": (3, 2)}
+    numbers = {"b": (2, 3), "a": (3, 2, 4)}  # compounds count as their larger piece
     found = [(one.folder, one.row, one.number, one.is_known) for one in module._images(sources, nothing)]
     assert found == [
         ("bins-a", 0, 1005, False),

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.detection import VERIFIED
+from kmn_jax.detection import VERIFIED, VERIFIER_SIDE
 from kmn_jax.errors import InputError
 from kmn_jax.files import read_safetensors, safetensors_bytes
 from kmn_jax.models import (
@@ -23,7 +23,7 @@ from kmn_jax.models import (
     verify,
 )
 
-CELLS = jax.random.normal(jax.random.key(1), (48, 48, VERIFIER_CHANNELS))
+CELLS = jax.random.normal(jax.random.key(1), (VERIFIER_SIDE, VERIFIER_SIDE, VERIFIER_CHANNELS))
 
 
 @pytest.fixture(scope="module")
