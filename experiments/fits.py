@@ -21,6 +21,7 @@ from kmn_jax.detection import (
     fit_calibration,
     fit_logistic,
     keeps_order,
+    vouched,
 )
 from kmn_jax.errors import InputError, require
 
@@ -125,27 +126,28 @@ def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], 
     """Fit the model of what reported poses of one search say about each other, given the log odds of each.
 
     What is judged are those that are probable enough beside the others to be listed.
-    Raises InputError if of two of one search the surer one would become the less probable one.
+    Raises InputError if the less sure ones of a search are right.
     """
     logits, poses = logits[poses["reported"]], _reported(poses)
     right, counts = poses["error"] < THRESHOLD, _as_asked(poses, options)
+    scenes = [np.flatnonzero(poses["search"] == search) for search in np.unique(poses["search"])]
     columns = np.zeros((len(logits), len(COMPANY)))
-    for search in np.unique(poses["search"]):
-        rows = poses["search"] == search
+    for rows in scenes:
         columns[rows] = company(logits[rows])
 
     def of_company(rows: Bool[np.ndarray, " s"]) -> Calibration:
         model = fit_logistic(columns[rows], right[rows], COMPANY, _SCALE_RIDGE, weights=counts[rows])
         if not keeps_order(model):
-            raise InputError(
-                "of two poses of one image the surer one would become the less probable one: give more bins"
-            )
+            raise InputError("of poses of one image those are right that are less sure: give more bins")
         return model
 
     held_out = np.zeros(len(logits))
     for names in _folds(poses, options):
         own = np.isin(poses["object"], names)
-        held_out[own] = of_company(~own).logit(columns[own])
+        others = of_company(~own)
+        for rows in scenes:
+            if own[rows[0]]:
+                held_out[rows] = vouched(logits[rows], others)
     listed = 1 / (1 + np.exp(-held_out)) >= DetectConfig().reported
     told_of = {name: values[listed] for name, values in poses.items()}
     results = _judged(told_of, held_out[listed], counts[listed])

@@ -15,6 +15,7 @@ from kmn_jax.detection._calibration import (
     load_probabilities,
     probabilities_bytes,
     reliability,
+    vouched,
 )
 from kmn_jax.detection._canonical import canonical_pose
 from kmn_jax.detection._coverage import near_surface
@@ -215,6 +216,7 @@ __all__ = [
     "table",
     "verified",
     "verifier_cells",
+    "vouched",
     "warnings_once",
     "with_grasps",
     "write_bop_csv",

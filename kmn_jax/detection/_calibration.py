@@ -162,11 +162,11 @@ def _by_range(
 
 
 COMPANY = ("own", "other")  # the evidence of `together`, see `company`
-_MOST_VOUCHED = 4.0  # log odds: who is surer vouches no more
+_VOUCHES, _MOST_VOUCHED = 2.0, 5.0  # log odds: who is less sure vouches for nobody, and who is surer no more
 
 
 def company(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2"]:
-    """Return of each pose of one scene its log odds, and those of the most probable other one, from even to 0.98.
+    """Return of each pose of one scene its log odds, and those of the most probable other one, from 0.88 to 0.993.
 
     That doubtful poses speak against each other is left out: so they do in full bins, which are what is fitted to, but
     not where the last copy lies.
@@ -176,7 +176,15 @@ def company(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2"]:
         second, first = np.argsort(logits)[-2:]
         other[:] = logits[first]
         other[first] = logits[second]
-    return np.stack([logits, np.clip(other, 0, _MOST_VOUCHED)], axis=1)
+    return np.stack([logits, np.clip(other, _VOUCHES, _MOST_VOUCHED)], axis=1)
+
+
+def vouched(logits: Float[np.ndarray, " s"], together: Calibration) -> Float[np.ndarray, " s"]:
+    """Return the log odds of the poses of one scene given each other; who vouches is no less probable for it."""
+    order = np.argsort(logits, kind="stable")
+    result = np.empty_like(logits)
+    result[order] = np.maximum.accumulate(together.logit(company(logits))[order])
+    return result
 
 
 @dataclass(frozen=True)
@@ -195,15 +203,12 @@ class Probabilities:
 
     def of_scene(self, evidence: Float[np.ndarray, "s f"]) -> Float[np.ndarray, " s"]:
         """Return the probabilities of all refined poses that stand in one scene."""
-        return self.together.probability(company(self.refined.logit(evidence)))
+        return _logistic(vouched(self.refined.logit(evidence), self.together))
 
 
 def keeps_order(together: Calibration) -> bool:
-    """Tell whether of two poses of one scene the surer one stays the more probable one."""
-    if together.values or len(together.weights) != len(COMPANY):
-        return False
-    own, other = together.weights  # the other one of the surer pose is the less sure one, by no more than they differ
-    return own > max(other, 0)
+    """Tell whether of two poses of one scene, whoever else is there, the surer one stays the more probable one."""
+    return len(together.weights) > 0 and together.weights[0] > 0 and not together.values
 
 
 def probabilities_bytes(probabilities: Probabilities) -> bytes:

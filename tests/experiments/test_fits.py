@@ -7,7 +7,7 @@ import pytest
 
 from experiments import fits
 from experiments.fits import FitOptions, fit, fit_together
-from kmn_jax.detection import company, expected_calibration_error
+from kmn_jax.detection import expected_calibration_error, vouched
 from kmn_jax.errors import InputError
 
 _OBJECTS, _POSES, _COLUMNS = 10, 60, 12
@@ -95,10 +95,10 @@ def test_poses_of_one_scene_vouch_for_each_other() -> None:
     assert losses[1] < 0.96 * losses[0]
     assert (held_out[-50:] < own[-50:]).mean() > 0.9  # who is alone is less often right than it looks
     assert 0.2 < (held_out > own).mean() < 0.8
-    np.testing.assert_allclose(model.logit(company(own[:poses])), held_out[:poses], atol=0.3)  # of others' scenes
+    np.testing.assert_allclose(vouched(own[:poses], model), held_out[:poses], atol=0.3)  # of others' scenes
     seldom = fit_together(rows, logits, FitOptions(in_vain=0.1))  # far less than there are
-    assert seldom.model.logit(company(own[-1:])) > model.logit(company(own[-1:])) + 0.5
-    with pytest.raises(InputError, match="less probable one"):
+    assert vouched(own[-1:], seldom.model) > vouched(own[-1:], model) + 0.5
+    with pytest.raises(InputError, match="less sure"):
         fit_together(rows, -logits, FitOptions())
 
 
