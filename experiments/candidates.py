@@ -35,6 +35,7 @@ from kmn_jax.detection import (
     refined_candidates,
     search_at,
     seeds_over,
+    standing,
     verified,
 )
 from kmn_jax.errors import InputError, shown
@@ -287,7 +288,7 @@ def _with_reported(poses: Columns, searched: dict[int, DevicePart], fits: FitOpt
         if len(rows):
             number = int(poses["object"][rows[0]])
             found = _choosable(poses["T_camera_object"][rows], poses["evidence"][rows])
-            reported[rows] = chosen(found, others[number], on_device, DetectConfig(), exact[number]).kept
+            reported[rows] = standing(found, others[number], exact[number], on_device, DetectConfig()).kept
     return poses | {"reported": reported}
 
 

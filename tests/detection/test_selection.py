@@ -233,12 +233,12 @@ def test_what_is_too_improbable_beside_the_others_is_not_kept() -> None:
     count, crop = np.zeros(2, dtype=np.int32), np.zeros(2, dtype=np.int64)
     nothing: Any = None  # what the network says of crops
     own, exact = Calibration(("x",), (1.0,), 0.0), Calibration(("x",), (0.0,), 0.0)
-    models = Probabilities(own, own, exact, Calibration(COMPANY, (1.0, 0.5), -2.0))
-    for other, kept in ((3.0, [True, True]), (-9.0, [False, False])):
-        evidence = np.array([[-1.5], [other]])
+    models = Probabilities(own, own, exact, Calibration(COMPANY, (1.0, 0.8), -2.5))
+    for first, other, kept in ((-1.5, 3.0, [True, True]), (-1.5, -9.0, [False, False]), (-3.0, 6.0, [True, True])):
+        evidence = np.array([[first], [other]])
         found = Candidates(poses, np.ones(2, dtype=bool), evidence, count, crop, nothing, crop[:1])
         choice, probability = reported(found, models, on_device(BOX), DetectConfig())
         assert choice.kept.tolist() == kept
-        assert choose_candidates(found, own, on_device(BOX), DetectConfig(), exact).kept[0]
-        vouched = -1.5 + 0.5 * max(other, 2) - 2
+        assert choose_candidates(found, own, on_device(BOX), DetectConfig(), exact).kept[0] == (first > -2)
+        vouched = first + 0.8 * np.clip(other, 2, 5) - 2.5
         assert probability[0] == pytest.approx(1 / (1 + np.exp(-vouched)))
