@@ -66,6 +66,7 @@ class Asked:
         monkeypatch.setattr(module, "_models", lambda poses, fits: models[bool(poses["refined"].all())])
         monkeypatch.setattr(module, "model_of", lambda poses, fits: 5)
         monkeypatch.setattr(module, "chosen", self.all_of)
+        monkeypatch.setattr(module, "standing", lambda found, own, exact, *given: self.all_of(found, own, *given))
         monkeypatch.setattr(module, "refined_candidates", lambda part, scene, found, *_: found)
 
     def searches(self, sources: Sources, network: Any) -> Any:
@@ -92,7 +93,7 @@ class Asked:
         self.proposed.append(own)
         return self.found(1, 0.0)
 
-    def all_of(self, found: Any, model: int, part: int, config: Any, exact: Any = None) -> Any:
+    def all_of(self, found: Any, model: int, part: int, config: Any) -> Any:
         self.chosen_by.append((part, model))
         count = len(found.usable)
         return SimpleNamespace(kept=np.ones(count, dtype=bool), contenders=np.zeros(count, dtype=bool))
@@ -196,8 +197,8 @@ def test_a_search_that_finds_nothing_is_kept_as_well(
 ) -> None:
     asked = Asked(monkeypatch)
 
-    def all_but_one(found: Any, model: int, part: int, config: Any, exact: Any = None) -> Any:
-        kept = asked.all_of(found, model, part, config, exact)
+    def all_but_one(found: Any, model: int, part: int, config: Any) -> Any:
+        kept = asked.all_of(found, model, part, config)
         kept.kept &= part != 0
         return kept
 
