@@ -15,7 +15,7 @@ what the verifier says there is no evidence. Of refined poses detection reports 
 model holds for the most probable, which is fitted to whether all points are in their places (MSSD), and not their mean
 (ADI). Models are too sure of themselves about kinds of objects that they were not fitted to: so the scales of the
 refined poses' models are fitted to what detection would report by models that do not know the kind. From the same
-poses a fourth model learns what poses of one scene say about each other.
+poses, of scans of which is known where parts are, a fourth model learns what poses of one scene say about each other.
 """
 
 from __future__ import annotations

@@ -35,7 +35,6 @@ from kmn_jax.detection import (
     refined_candidates,
     search_at,
     seeds_over,
-    standing,
     verified,
 )
 from kmn_jax.errors import InputError, shown
@@ -51,6 +50,7 @@ _COLUMNS = (  # of what is stored
     "object",
     "search",
     "known",  # whether the network, or the verifier, was trained with such parts
+    "narrowed",
     "T_camera_object",
     "refined",
     "due",  # whether they are of what detection chooses among, which refines less
@@ -288,7 +288,7 @@ def _with_reported(poses: Columns, searched: dict[int, DevicePart], fits: FitOpt
         if len(rows):
             number = int(poses["object"][rows[0]])
             found = _choosable(poses["T_camera_object"][rows], poses["evidence"][rows])
-            reported[rows] = standing(found, others[number], exact[number], on_device, DetectConfig()).kept
+            reported[rows] = chosen(found, others[number], on_device, DetectConfig(), exact[number]).kept
     return poses | {"reported": reported}
 
 

@@ -236,7 +236,7 @@ def _found(name: str, model: Model, fitted: Probabilities, image: BinImage) -> D
     if len(rows):
         with clock("refinement"):
             candidates = refined_candidates(on_device, image.scene, candidates, rows, 0, CONFIG.search)
-            choice, probability = reported(candidates, fitted, on_device, CONFIG)
+            choice, probability = reported(candidates, fitted, on_device, CONFIG, image.scene.is_narrowed)
     else:
         probability = fitted.found.probability(candidates.evidence)
     poses = detections(candidates, choice, probability, image.part, image.scene)

@@ -123,35 +123,36 @@ def fit(poses: dict[str, np.ndarray], options: FitOptions) -> Fitted:
 
 
 def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: FitOptions) -> Fitted:
-    """Fit the model of what reported poses of one search say about each other, given the log odds of each.
+    """Fit the model of what reported poses of one narrowed search say about each other, given the log odds of each.
 
-    What is judged are those that are probable enough beside the others to be listed.
-    Raises InputError if the less sure ones of a search are right.
+    What is judged are all reported poses, of which those of other searches, and those that are alone, keep their odds.
+    Raises InputError if no two poses are reported of one such search, or the less sure ones are right.
     """
     logits, poses = logits[poses["reported"]], _reported(poses)
-    right, counts = poses["error"] < THRESHOLD, _as_asked(poses, options)
-    scenes = [np.flatnonzero(poses["search"] == search) for search in np.unique(poses["search"])]
+    right, together = poses["error"] < THRESHOLD, poses["narrowed"].copy()
+    rows_of = [np.flatnonzero(poses["search"] == search) for search in np.unique(poses["search"])]
     columns = np.zeros((len(logits), len(COMPANY)))
-    for rows in scenes:
+    for rows in rows_of:
         columns[rows] = company(logits[rows])
+        together[rows] &= len(rows) > 1
+    if not together.any():
+        raise InputError("in no image of the bins are two poses reported: give more bins")
 
     def of_company(rows: Bool[np.ndarray, " s"]) -> Calibration:
-        model = fit_logistic(columns[rows], right[rows], COMPANY, _SCALE_RIDGE, weights=counts[rows])
+        model = fit_logistic(columns[rows], right[rows], COMPANY, _SCALE_RIDGE)
         if not keeps_order(model):
             raise InputError("of poses of one image those are right that are less sure: give more bins")
         return model
 
-    held_out = np.zeros(len(logits))
+    held_out = logits.copy()
     for names in _folds(poses, options):
-        own = np.isin(poses["object"], names)
-        others = of_company(~own)
-        for rows in scenes:
-            if own[rows[0]]:
-                held_out[rows] = vouched(logits[rows], others)
-    listed = 1 / (1 + np.exp(-held_out)) >= DetectConfig().reported
-    told_of = {name: values[listed] for name, values in poses.items()}
-    results = _judged(told_of, held_out[listed], counts[listed])
-    return Fitted(of_company(np.ones(len(right), dtype=bool)), held_out, results)
+        own = together & np.isin(poses["object"], names)
+        if own.any():
+            others = of_company(together & ~own)
+            for rows in rows_of:
+                if own[rows].any():
+                    held_out[rows] = vouched(logits[rows], others)
+    return Fitted(of_company(together), held_out, _judged(poses, held_out, _as_asked(poses, options)))
 
 
 def _reported(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

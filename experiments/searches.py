@@ -87,6 +87,7 @@ class Search:
             "largest_error": self.errors(poses, self.image.largest_errors) if is_own else error,
             "object": np.full(len(poses), self.number),
             "search": np.full(len(poses), self.row),
+            "narrowed": np.full(len(poses), self.scene.is_narrowed),
             "T_camera_object": poses,  # to judge it by other evidence
         }
 

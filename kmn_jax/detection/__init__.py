@@ -46,7 +46,6 @@ from kmn_jax.detection._detect import (
     explore,
     refined_candidates,
     reported,
-    standing,
 )
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place, symmetry_transforms
 from kmn_jax.detection._draw import (
@@ -211,7 +210,6 @@ __all__ = [
     "select",
     "select_poses",
     "spread_seeds",
-    "standing",
     "surface_scores",
     "surroundings",
     "symmetry_transforms",

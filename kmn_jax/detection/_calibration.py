@@ -161,30 +161,12 @@ def _by_range(
     return rows
 
 
-COMPANY = ("own", "other")  # the evidence of `together`, see `company`
-_VOUCHES, _MOST_VOUCHED = 2.0, 5.0  # log odds: who is less sure vouches for nobody, and who is surer no more
+COMPANY = ("own", "best")  # the evidence of `together`, see `company`
 
 
 def company(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2"]:
-    """Return of each pose of one scene its log odds, and those of the most probable other one, from 0.88 to 0.993.
-
-    That doubtful poses speak against each other is left out: so they do in full bins, which are what is fitted to, but
-    not where the last copy lies.
-    """
-    other = np.zeros_like(logits)
-    if len(logits) > 1:
-        second, first = np.argsort(logits)[-2:]
-        other[:] = logits[first]
-        other[first] = logits[second]
-    return np.stack([logits, np.clip(other, _VOUCHES, _MOST_VOUCHED)], axis=1)
-
-
-def vouched(logits: Float[np.ndarray, " s"], together: Calibration) -> Float[np.ndarray, " s"]:
-    """Return the log odds of the poses of one scene given each other; who vouches is no less probable for it."""
-    order = np.argsort(logits, kind="stable")
-    result = np.empty_like(logits)
-    result[order] = np.maximum.accumulate(together.logit(company(logits))[order])
-    return result
+    """Return of each pose of one scene its log odds, and those of the most probable pose there."""
+    return np.stack([logits, np.full_like(logits, logits.max(initial=-np.inf))], axis=1)
 
 
 @dataclass(frozen=True)
@@ -192,8 +174,9 @@ class Probabilities:
     """The model of poses as they are found, which chooses among them, and that of refined ones, which is reported.
 
     `exact` is of refined poses that are right in all of their points, not on average: it tells poses of one place apart
-    that are turned against each other. `together` is of poses in one scene, by what `refined` says of each: if one is
-    sure, doubtful ones are more often right, and one that is alone is less often right than it looks.
+    that are turned against each other. `together` is of poses in one scene of which was said where parts are, by what
+    `refined` says of each: if one is sure, doubtful ones are more often right. Anywhere else poses tell little about
+    each other: there are walls, and other parts, to be mistaken.
     """
 
     found: Calibration
@@ -201,13 +184,23 @@ class Probabilities:
     exact: Calibration
     together: Calibration
 
-    def of_scene(self, evidence: Float[np.ndarray, "s f"]) -> Float[np.ndarray, " s"]:
+    def of_scene(self, evidence: Float[np.ndarray, "s f"], is_narrowed: bool) -> Float[np.ndarray, " s"]:
         """Return the probabilities of all refined poses that stand in one scene."""
-        return _logistic(vouched(self.refined.logit(evidence), self.together))
+        logits = self.refined.logit(evidence)
+        return _logistic(vouched(logits, self.together) if is_narrowed else logits)
+
+
+def vouched(logits: Float[np.ndarray, " s"], together: Calibration) -> Float[np.ndarray, " s"]:
+    """Return the log odds of poses that vouch for each other: none has less than alone, and their order stays.
+
+    That doubtful poses speak against each other is left out: so they do in full bins, which are what is fitted to, but
+    not where the last copy lies.
+    """
+    return np.maximum(logits, together.logit(company(logits))) if len(logits) > 1 else logits
 
 
 def keeps_order(together: Calibration) -> bool:
-    """Tell whether of two poses of one scene, whoever else is there, the surer one stays the more probable one."""
+    """Tell whether of two poses of one scene that have company the surer one stays the more probable one."""
     return len(together.weights) > 0 and together.weights[0] > 0 and not together.values
 
 

@@ -47,7 +47,6 @@ from kmn_jax.programs import meanwhile
 
 _SHARES = ("explained", "violated", "occluded", "unknown")
 _CLOSE_GAP = 0.05  # of probabilities
-_DOUBTFUL = 0.03  # the probability that a refined pose has at least by what speaks for it alone
 _CONSIDERED = 128  # most probable poses that are compared with each other: one number, so one compilation
 _MOST_UNEXPLAINED = 0.5  # of the foreground: with more, it is told how to narrow it down
 _FLUSH = 0.4  # of the outline: with more of it in the plane of a larger surface, a pose may be on a wall or a table
@@ -150,7 +149,7 @@ def detect(
             rows = np.flatnonzero(choice.kept | choice.contenders)
             found = refined_candidates(on_device, scene, found, rows, random_seed, search)
         with clock("selection"):
-            choice, probability = reported(found, probabilities, on_device, config)
+            choice, probability = reported(found, probabilities, on_device, config, scene.is_narrowed)
     else:
         probability = probabilities.found.probability(found.evidence)
     with clock("report"):
@@ -296,25 +295,14 @@ def chosen(
     return Selection(*map(of_all, few))
 
 
-def standing(
-    refined: Candidates, own: Calibration, exact: Calibration, part: DevicePart, config: DetectConfig
-) -> Selection:
-    """Choose among refined candidates by what speaks for each alone: also doubtful ones, for which others may vouch."""
-    doubtful = replace(config, reported=min(config.reported, _DOUBTFUL))
-    return chosen(refined, own, part, doubtful, exact)
-
-
 def reported(
-    refined: Candidates, probabilities: Probabilities, part: DevicePart, config: DetectConfig
+    refined: Candidates, probabilities: Probabilities, part: DevicePart, config: DetectConfig, is_narrowed: bool
 ) -> tuple[Selection, Float[np.ndarray, " s"]]:
-    """Choose among refined candidates, and return also how probable those that stand are, given each other.
-
-    Those that stand by what speaks for each alone, but are too improbable beside the others, are not kept.
-    """
-    choice = standing(refined, probabilities.refined, probabilities.exact, part, config)
+    """Choose among refined candidates, and return also how probable those that stand are, given each other."""
+    choice = chosen(refined, probabilities.refined, part, config, probabilities.exact)
     probability = np.zeros(len(choice.kept))
-    probability[choice.kept] = probabilities.of_scene(refined.evidence[choice.kept])
-    return choice._replace(kept=choice.kept & (probability >= config.reported)), probability
+    probability[choice.kept] = probabilities.of_scene(refined.evidence[choice.kept], is_narrowed)
+    return choice, probability
 
 
 def detections(

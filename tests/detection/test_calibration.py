@@ -20,7 +20,6 @@ from kmn_jax.detection import (
     CalibrationArrays,
     Probabilities,
     chance_calibration_error,
-    company,
     device_calibration,
     expected_calibration_error,
     fit_calibration,
@@ -183,32 +182,20 @@ def test_several_members_are_the_mean_of_their_models() -> None:
 
 def test_sure_poses_vouch_for_others_of_their_scene() -> None:
     own = Calibration(("x",), (1.0,), 0.0)
-    models = Probabilities(own, own, own, Calibration(COMPANY, (0.9, 1.1), -4.0))
+    models = Probabilities(own, own, own, Calibration(COMPANY, (1.1, 1.15), -4.8))
     rng = np.random.default_rng(0)
-    assert len(models.of_scene(np.zeros((0, 1)))) == 0
+    assert len(models.of_scene(np.zeros((0, 1)), True)) == 0
     for count in (1, 2, 3, 12):
         evidence = 3 * rng.normal(size=(count, 1))
-        together = models.of_scene(evidence)
-        assert (np.diff(together[np.argsort(evidence[:, 0], kind="stable")]) >= 0).all()  # the order stays
-    lonely = models.of_scene(np.array([[-1.0]]))
-    np.testing.assert_allclose(lonely, 1 / (1 + np.exp(0.9 - 2.2 + 4)), rtol=1e-12)
-    doubtful, with_a_sure_one, surer = (models.of_scene(np.array([[-1.0], [other]])) for other in (1.9, 5.0, 9.0))
-    np.testing.assert_allclose(doubtful[0], lonely[0], rtol=1e-12)
-    np.testing.assert_allclose(with_a_sure_one[0], 1 / (1 + np.exp(0.9 - 5.5 + 4)), rtol=1e-12)
-    assert surer[0] == with_a_sure_one[0]
-    np.testing.assert_allclose(
-        with_a_sure_one[1], 1 / (1 + np.exp(-4.5 - 2.2 + 4)), rtol=1e-12
-    )  # nobody vouches for it
-    alike = models.of_scene(np.array([[4.9], [5.0]]))  # who is vouched for is no more probable than who vouches
-    assert alike[0] == alike[1]
-
-
-def test_the_other_one_is_the_most_probable_of_the_rest() -> None:
-    np.testing.assert_array_equal(company(np.array([2.5, 7.0, 3.0, -1.0]))[:, 1], [5, 3, 5, 5])
-    np.testing.assert_array_equal(company(np.array([3.0, 3.0]))[:, 1], [3, 3])
-    np.testing.assert_array_equal(company(np.array([-2.0, 4.0])), [[-2, 4], [4, 2]])
-    np.testing.assert_array_equal(company(np.array([5.0])), [[5, 2]])
-    assert company(np.zeros(0)).shape == (0, 2)
+        alone = own.probability(evidence)
+        np.testing.assert_allclose(models.of_scene(evidence, False), alone, rtol=1e-12)
+        together = models.of_scene(evidence, True)
+        assert (together >= alone).all()
+        assert (np.diff(together[np.argsort(alone, kind="stable")]) >= 0).all()  # the order stays
+    np.testing.assert_allclose(models.of_scene(np.array([[1.2]]), True), own.probability(np.array([[1.2]])), rtol=1e-12)
+    doubtful, with_a_sure_one = np.array([[-1.0], [-2.0]]), np.array([[-1.0], [6.0]])
+    np.testing.assert_allclose(models.of_scene(doubtful, True), own.probability(doubtful), rtol=1e-12)
+    assert models.of_scene(with_a_sure_one, True)[0] > 2 * own.probability(doubtful)[0]
 
 
 def test_reliability_counts_every_pose_once() -> None:
@@ -237,7 +224,7 @@ def test_what_counts_twice_is_as_if_it_was_there_twice() -> None:
 def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.calibration.json"
     logistic = Calibration(NAMES, (1.0, -2.5, 1e-3), 0.25)
-    together = Calibration(COMPANY, (1.1, 0.7), -0.4)
+    together = Calibration(COMPANY, (1.1, 1.2), -4.8)
     fitted = Probabilities(logistic, fit_calibration(*drawn(200), NAMES), logistic, together)
     path.write_bytes(probabilities_bytes(fitted))
     loaded = load_probabilities(path, NAMES)

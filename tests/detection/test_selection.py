@@ -11,14 +11,11 @@ import numpy as np
 import pytest
 
 from kmn_jax.detection import (
-    COMPANY,
     Calibration,
     Candidates,
     DetectConfig,
     DevicePart,
-    Probabilities,
     Selection,
-    reported,
     same_place,
     select,
     symmetry_transforms,
@@ -226,19 +223,3 @@ def test_of_turned_poses_in_one_place_the_exact_one_stands() -> None:
     assert by_exact.gap[0] == pytest.approx(1 / (1 + np.exp(-2.0)) - 1 / (1 + np.exp(2.0)), abs=1e-6)
     doubted = Calibration(names, (0.0, 0.0), -5.0)  # what is not probable enough is not reported, however exact
     assert not choose_candidates(found, doubted, part, config, exact).kept.any()
-
-
-def test_what_is_too_improbable_beside_the_others_is_not_kept() -> None:
-    poses = np.stack([moved(0, 0, 0), moved(9, 0, 0)]).astype(np.float32)
-    count, crop = np.zeros(2, dtype=np.int32), np.zeros(2, dtype=np.int64)
-    nothing: Any = None  # what the network says of crops
-    own, exact = Calibration(("x",), (1.0,), 0.0), Calibration(("x",), (0.0,), 0.0)
-    models = Probabilities(own, own, exact, Calibration(COMPANY, (1.0, 0.8), -2.5))
-    for first, other, kept in ((-1.5, 3.0, [True, True]), (-1.5, -9.0, [False, False]), (-3.0, 6.0, [True, True])):
-        evidence = np.array([[first], [other]])
-        found = Candidates(poses, np.ones(2, dtype=bool), evidence, count, crop, nothing, crop[:1])
-        choice, probability = reported(found, models, on_device(BOX), DetectConfig())
-        assert choice.kept.tolist() == kept
-        assert choose_candidates(found, own, on_device(BOX), DetectConfig(), exact).kept[0] == (first > -2)
-        vouched = first + 0.8 * np.clip(other, 2, 5) - 2.5
-        assert probability[0] == pytest.approx(1 / (1 + np.exp(-vouched)))

@@ -61,7 +61,7 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
         assert poses["refined"].all()
         return [(np.unique(poses["object"]), int((poses["error"] < 0.1).sum()))]
 
-    def all_but_the_first(found: Candidates, model: int, exact: int, part: Any, config: Any) -> Any:
+    def all_but_the_first(found: Candidates, model: int, part: Any, config: Any, exact: int) -> Any:
         assert (model, exact) == (5, 2)
         assert found.evidence.shape[1] == len(EVIDENCE)
         return SimpleNamespace(kept=np.arange(len(found.usable)) > 0)
@@ -70,7 +70,7 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "picture_evidence", shown)
     monkeypatch.setattr(module, "verified", shown_to_verifier)
     monkeypatch.setattr(module, "held_out_models", models)
-    monkeypatch.setattr(module, "standing", all_but_the_first)
+    monkeypatch.setattr(module, "chosen", all_but_the_first)
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +92,7 @@ def store(path: Path, network: Model, names: tuple[str, ...] = EVIDENCE, **other
         "object": np.array([7, 7, 7, 7, 8, 8]),
         "search": np.array([0, 0, 0, 0, 1, 1]),
         "known": np.zeros(6, dtype=bool),
+        "narrowed": np.zeros(6, dtype=bool),
         "T_camera_object": poses,
         "refined": np.array([False, True, True, True, True, True]),
         "due": np.array([False, True, True, True, False, False]),

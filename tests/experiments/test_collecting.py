@@ -66,7 +66,6 @@ class Asked:
         monkeypatch.setattr(module, "_models", lambda poses, fits: models[bool(poses["refined"].all())])
         monkeypatch.setattr(module, "model_of", lambda poses, fits: 5)
         monkeypatch.setattr(module, "chosen", self.all_of)
-        monkeypatch.setattr(module, "standing", lambda found, own, exact, *given: self.all_of(found, own, *given))
         monkeypatch.setattr(module, "refined_candidates", lambda part, scene, found, *_: found)
 
     def searches(self, sources: Sources, network: Any) -> Any:
@@ -76,7 +75,7 @@ class Asked:
 
             def columns(found: Any, row: int = row, own: int = own) -> dict[str, np.ndarray]:
                 count = int(found.usable.sum())
-                numbers = {"object": 7 + own, "search": row, "error": 0.01, "largest_error": 0.01}
+                numbers = {"object": 7 + own, "search": row, "error": 0.01, "largest_error": 0.01, "narrowed": False}
                 rows = {name: np.full(count, value) for name, value in numbers.items()}
                 poses = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1))
                 return rows | {"evidence": np.full((count, len(EVIDENCE)), found.evidence[0]), "T_camera_object": poses}
@@ -93,7 +92,7 @@ class Asked:
         self.proposed.append(own)
         return self.found(1, 0.0)
 
-    def all_of(self, found: Any, model: int, part: int, config: Any) -> Any:
+    def all_of(self, found: Any, model: int, part: int, config: Any, exact: Any = None) -> Any:
         self.chosen_by.append((part, model))
         count = len(found.usable)
         return SimpleNamespace(kept=np.ones(count, dtype=bool), contenders=np.zeros(count, dtype=bool))
@@ -197,8 +196,8 @@ def test_a_search_that_finds_nothing_is_kept_as_well(
 ) -> None:
     asked = Asked(monkeypatch)
 
-    def all_but_one(found: Any, model: int, part: int, config: Any) -> Any:
-        kept = asked.all_of(found, model, part, config)
+    def all_but_one(found: Any, model: int, part: int, config: Any, exact: Any = None) -> Any:
+        kept = asked.all_of(found, model, part, config, exact)
         kept.kept &= part != 0
         return kept
 
