@@ -2,9 +2,9 @@
 
 It learns which poses are right from those that `python -m experiments.calibrate --candidates FILE` has found in known
 worlds, once they are moved onto the depth image, as those that it is shown are; name FILE, images and worlds as there.
-How it does on the refined poses of all other images, to which
-probabilities are fitted, is told, and nothing is chosen by it. Afterwards raise the number of
-`kmn_jax.detection.VERIFIED`, and fit again by the same FILE, whose poses are judged anew.
+How it does on the refined poses of all other images, to which probabilities are fitted, is told, and nothing is chosen
+by it. Afterwards raise the number of `kmn_jax.detection.VERIFIED`, and fit again by the same FILE, whose poses are
+judged anew.
 """
 
 from __future__ import annotations
