@@ -65,7 +65,6 @@ def verifier_cells(
     def within(lengths: Float[Array, "s s"], of: Bool[Array, "s s"], most: float) -> Float[Array, "s s"]:
         return jnp.where(of, jnp.clip(lengths / diameter, -most, most), 0)
 
-    ways = jnp.stack([seen.u, seen.v, jnp.ones_like(seen.u)], axis=-1)
     channels = (
         mask,
         there,
@@ -76,7 +75,9 @@ def verifier_cells(
         found.has_normal,
         within(found.away, both, _MOST_GAP) / _MOST_GAP,
         within(found.noise, there, _MOST_NOISE) / _MOST_NOISE,
-        jnp.where(found.has_normal, -(found.normals * ways).sum(axis=-1), 0),  # of what faces the image's plane 1
+        jnp.where(
+            found.has_normal, -(found.normals * _directions(seen)).sum(axis=-1), 0
+        ),  # of what faces the image's plane 1
         found.in_image,
     )
     assert len(channels) == VERIFIER_CHANNELS
@@ -130,7 +131,7 @@ def measured(seen: Predicted, image: DepthImage, diameter: Scalar) -> Measured:
     depth = jnp.where(own, samples, 0).sum(axis=0) / count
     noise = jnp.sqrt(jnp.where(own, (samples - depth[None]) ** 2, 0).sum(axis=0) / jnp.maximum(count - 1, 1))
     away = jnp.where(real, jnp.abs(samples - seen.depth[None]), jnp.inf).min(axis=0)
-    points = jnp.stack([seen.u, seen.v, jnp.ones_like(seen.u)], axis=-1) * depth[..., None]
+    points = _directions(seen) * depth[..., None]
     reach = _ONE_SURFACE * diameter + _STEEP * seen.pitch * seen.nearest
     (along_u, has_u), (along_v, has_v) = (_slope(points, there, axis, reach) for axis in (1, 0))
     normals = jnp.cross(along_v, along_u)
@@ -147,6 +148,11 @@ def measured(seen: Predicted, image: DepthImage, diameter: Scalar) -> Measured:
         normals,
         has_u & has_v & (length[..., 0] > 1e-12),
     )
+
+
+def _directions(seen: Predicted) -> Float[Array, "s s 3"]:
+    """Return the directions (u, v, 1) to the centres of cells."""
+    return jnp.stack([seen.u, seen.v, jnp.ones_like(seen.u)], axis=-1)
 
 
 def _slope(
