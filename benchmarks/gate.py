@@ -52,8 +52,9 @@ def main(update: bool = False, repeats: int = 5, json: Path | None = None) -> in
         json: where the ratios go.
     """
     case = make_case(1)
+    network = network_pair(case)
     pairs = {
-        "network, cached object, over dense JAX": network_pair(case),
+        "network, cached object, over dense JAX": network,
         "gradient of the network over dense JAX": gradient_pair(case),
         "pair head over dense JAX": head_pair(case),
         "graph of 2048 coordinates over one top_k": neighbor_pair(points_in_order(2048, 3), neighbor_graph),
@@ -61,7 +62,7 @@ def main(update: bool = False, repeats: int = 5, json: Path | None = None) -> in
         "20 nearest of 2048 coordinates over one top_k": neighbor_pair(
             jax.random.normal(jax.random.key(0), (2048, 3)), lambda x, k: k_nearest(x, x, k)
         ),
-        "crop to refined pose over a dense forward": pose_pair(case),
+        "crop to refined pose over a dense forward": pose_pair(network.plain),
     }
     ratios = {name: times_faster(pair, repeats) for name, pair in pairs.items()}
     if update:
@@ -148,15 +149,15 @@ def neighbor_pair(x: jax.Array, nearest: Callable[[jax.Array, int], jax.Array]) 
     )
 
 
-def pose_pair(case: Case) -> Pair:
-    """The released network from a crop to the refined pose, beside one dense forward of the published network.
+def pose_pair(forward: Callable[[], Any]) -> Pair:
+    """The released network from a crop to the refined pose, beside one dense `forward` of the published network.
 
     With all draws, so that its work is the same for any key. Not the same result, but both take the same time on every
     run, which a rival's RANSAC does not.
     """
     model, part, cloud = small_crop()
     config = replace(SEARCH.of_network(model.config), enough=None)
-    return Pair(lambda: poses_at(model, part, cloud, 0, 0, config), _ready(dense_jax_forward, case))
+    return Pair(lambda: poses_at(model, part, cloud, 0, 0, config), forward)
 
 
 def _ready(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:

@@ -33,6 +33,7 @@ def assert_failed(result, status):
         assert np.isfinite(field).all()
 
 
+@pytest.mark.usefixtures("all_optimisations")  # it runs for long
 @pytest.mark.parametrize("use_normals", [True, False])
 def test_recovers_the_pose_in_99_of_100_draws_at_20_percent_inliers(use_normals):
     @jax.jit
