@@ -56,7 +56,7 @@ _COLUMNS = (  # of what is stored
     "due",  # whether they are of what detection chooses among, which refines less
     "reported",
 )
-_HOW = 7  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
+_HOW = 8  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
 _IN_MEMORY = 600  # searches, of each of which what was found first, crops and all, takes 10 MB
 _AT_ONCE = 2  # searches: one alone leaves a part of two cores idle
 

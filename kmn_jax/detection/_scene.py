@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
+from kmn_jax.detection._averaging import averaged, onto
 from kmn_jax.detection._depth_agreement import DepthImage, depth_buffer
 from kmn_jax.detection._foreground import ForegroundOptions, foreground
 from kmn_jax.detection._frames import MOST_BEHIND, into, placed
@@ -81,10 +82,11 @@ def make_scene(
             f"the scan lies {distance:.3g} {scan.unit} from its sensor, {distance / diameter:.2g} times the object's"
             " diameter: say where in its frame the sensor was (--sensor), and in which unit"
         )
-    seen = scan
-    moved = not np.array_equal(view.T_scene_camera, np.eye(4)) or scan.points.dtype != np.float32
-    if moved or len(view.rows) < len(scan.points):
-        seen = Scan(view.points, None, None, None, scan.unit)
+    is_image = scan.depth is not None and scan.camera is not None
+    if is_image:
+        averages = averaged(view.depth, view.camera, diameter)
+        view = view._replace(points=onto(view.points, view.camera, view.depth, averages), depth=averages)
+    seen = Scan(view.points, None, view.depth if is_image else None, scan.camera if is_image else None, scan.unit)
     warnings: tuple[str, ...] = ()
     if inside is None:
         front, warnings = foreground(seen, diameter, background or ForegroundOptions(), view.T_scene_camera)
