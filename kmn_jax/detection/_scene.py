@@ -68,10 +68,11 @@ def make_scene(
 ) -> Scene:
     """Make a scan ready for searches of objects of about a diameter.
 
-    `sensor` is where it was measured from, by default the origin; a depth image is in its sensor's frame. Foreground is
-    what `background` leaves, or the points that are `inside` of a known region. However a scan is thinned out, the
-    points nearest to places `keep` stay. Places and sensor are in the scan's frame. The same arguments give the same
-    scene. Raises InputError if the sensor's place lies among the points, or if no foreground is left.
+    `sensor` is where it was measured from, by default the origin; a depth image is in its sensor's frame, and is
+    `averaged` where it is noisy, and so are its points. Foreground is what `background` leaves, or the points that are
+    `inside` of a known region. However a scan is thinned out, the points nearest to places `keep` stay. Places and
+    sensor are in the scan's frame. The same arguments give the same scene. Raises InputError if the sensor's place lies
+    among the points, or if no foreground is left.
     """
     if sensor is not None and scan.camera is not None:
         raise InputError("a depth image is in the frame of its sensor: leave the sensor's place out")
