@@ -9,7 +9,7 @@ from kmn_jax.geometry import Camera
 
 # Lengths are in diameters of the object.
 _NOISY = 0.005  # from such noise on averages are taken
-_SIDE = 3  # pixels, of a window: wider ones find no more, and fewer copies that are far away
+_SIDE = 3  # pixels, of a window: wider ones seem to find more by stereo, and less far away
 _WIDEST = 0.05  # side of a window at most
 _QUANTILE = 0.68  # of the errors of an even surface: one deviation
 _STEP = 3  # rows and columns from one that noise is measured along to the next
