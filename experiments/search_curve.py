@@ -45,6 +45,8 @@ SETTINGS = {
     "fast, patience 4": replace(FAST, patience=4),
     "fast, all finely": replace(FAST, patience=None),
     PLAIN: _USUAL,
+    "goes on from 0.2": replace(_USUAL, promising=0.2),
+    "goes on from 0.1": replace(_USUAL, promising=0.1),
     "four draws": _with_crops(_USUAL, num_draws=4),
     "1,024 points a draw": _with_crops(_USUAL, num_points=1024),
     "thorough": THOROUGH,

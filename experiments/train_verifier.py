@@ -31,7 +31,7 @@ from experiments.candidates import read_poses, searches_of
 from experiments.detect_bins import PRECISION, Tally
 from experiments.fits import FitOptions, told, weights_of
 from experiments.searches import Columns, Sources
-from kmn_jax.detection import VERIFIER_SIDE, call_rows, polish, verifier_cells
+from kmn_jax.detection import PREDICTED_CHANNELS, VERIFIER_SIDE, call_rows, polish, verifier_cells
 from kmn_jax.errors import InputError, require
 from kmn_jax.files import write_whole
 from kmn_jax.models import (
@@ -51,6 +51,7 @@ from kmn_jax.typing import PRNGKey, Scalar
 
 _AT_ONCE = 256  # poses that are verified
 _LEAST_RATE = 1e-6
+_SPOILED = 1 / 6, 1 / 2  # of a picture's sides, what is spoiled of it
 
 
 @dataclass(frozen=True)
@@ -171,8 +172,9 @@ def _train_step(
     key: PRNGKey,
 ) -> State:
     """Return the state after one more step; `key` is that of the run."""
-    turns, drops = jax.random.split(jax.random.fold_in(key, state.step))
+    turns, spoils, drops = jax.random.split(jax.random.fold_in(key, state.step), 3)
     cells = jax.vmap(_turned)(cells, jax.random.bernoulli(turns, shape=(len(cells), 3)))
+    cells = jax.vmap(_spoiled)(cells, jax.random.split(spoils, len(cells)))
     keys = jax.random.split(drops, len(cells))
 
     def loss(parameters: nnx.State) -> Scalar:
@@ -188,6 +190,22 @@ def _turned(cells: Float[Array, "s s c"], which: Bool[Array, "3"]) -> Float[Arra
     cells = jnp.where(which[0], cells[::-1], cells)
     cells = jnp.where(which[1], cells[:, ::-1], cells)
     return jnp.where(which[2], jnp.swapaxes(cells, 0, 1), cells)
+
+
+def _spoiled(cells: Float[Array, "s s c"], key: PRNGKey) -> Float[Array, "s s c"]:
+    """Return a picture as it is, or, as often, as if nothing was measured in a rectangle of it.
+
+    What tells a pose must not lie in one place alone: of parts that are not known it does so less often.
+    """
+    whether, where = jax.random.split(key)
+    *shares, row, column = jax.random.uniform(where, (4,))
+    least, most = _SPOILED
+    height, width = (least + (most - least) * share for share in shares)
+    place = jnp.arange(len(cells), dtype=jnp.float32) / len(cells)
+    rows, columns = (jnp.abs(place - middle) < size / 2 for middle, size in ((row, height), (column, width)))
+    is_measured = ~jnp.isin(jnp.arange(cells.shape[-1]), jnp.asarray(PREDICTED_CHANNELS))
+    lost = rows[:, None, None] & columns[None, :, None] & is_measured[None, None]
+    return jnp.where(lost & jax.random.bernoulli(whether), 0, cells)
 
 
 def log_odds_of(verifier: Verifier, cells: Float16[np.ndarray, "p s s c"]) -> Float[np.ndarray, " p"]:
@@ -217,8 +235,8 @@ Made by `experiments/train_verifier.py`; change that, not this file.
 
 - **Weights**: `{options.output.name}`, SHA-256 `{digest[:16]}…`; `kmn_jax.models.load_verifier` loads them. What they
   say of refined poses is one column of the evidence that probabilities are fitted to.
-- **Data**: poses as they are found in known worlds (docs/data.md), moved onto the depth image; {options.epochs} epochs,
-  batches of {options.batch}.
+- **Data**: poses as they are found in known worlds (docs/data.md), moved onto the depth image, half of the pictures
+  with a rectangle in which nothing was measured; {options.epochs} epochs, batches of {options.batch}.
 - **Command**: `{facts["command"]}`, commit {facts["commit"]}.
 
 Of poses by what it says alone; "other parts" are refined poses such as detection chooses among, of images and parts

@@ -70,7 +70,7 @@ from kmn_jax.detection._kept_parts import prepare_kept
 from kmn_jax.detection._mapping import call_rows, map_real, map_rows
 from kmn_jax.detection._output import as_json, describe, table, write_bop_csv, write_json
 from kmn_jax.detection._picture_agreement import PictureAgreement, picture_agreement
-from kmn_jax.detection._picture_cells import VERIFIER_SIDE, verifier_cells
+from kmn_jax.detection._picture_cells import PREDICTED_CHANNELS, VERIFIER_SIDE, verifier_cells
 from kmn_jax.detection._polish import polish
 from kmn_jax.detection._result import CropPrediction, Detection, Detections, Pick, Timing, pose_notes, warnings_once
 from kmn_jax.detection._scene import MOST_POINTS, Scene, make_scene
@@ -100,6 +100,7 @@ __all__ = [
     "MOST_POINTS",
     "NUM_SEEDS",
     "PICTURE_EVIDENCE",
+    "PREDICTED_CHANNELS",
     "THOROUGH",
     "TREE_SETTINGS",
     "VERIFIED",

@@ -28,8 +28,8 @@ class Coverage(NamedTuple):
 
     left: Bool[np.ndarray, " r"]  # of the scene's points: foreground that no likely pose explains
     away: Float[np.ndarray, " r"]  # from the nearest seed that is near; it is not kept up where a point is not left
-    places: Float[np.ndarray, "p 3"]  # centres of likely poses
-    barren: int  # rounds since a copy was found
+    places: Float[np.ndarray, "p 3"]  # centres of promising poses
+    barren: int  # rounds since one was found in a new place
 
 
 def nothing_covered(scene: Scene) -> Coverage:
@@ -43,9 +43,13 @@ def cover(
     part: Part,
     found: Candidates,
     likely: Bool[np.ndarray, " s"],
+    promising: Bool[np.ndarray, " s"],
     reach: float,
 ) -> Coverage:
-    """Return the state after a round; a likely pose is a new copy if none before it is nearer than `reach`."""
+    """Return the state after a round, in which likely poses explain points.
+
+    A promising pose is in a new place if none before it is nearer than `reach`.
+    """
     from scipy.spatial import cKDTree
 
     rows = np.flatnonzero(before.left)
@@ -55,12 +59,11 @@ def cover(
     away[rows] = np.minimum(away[rows], distance)
 
     centers = (found.T_camera_object @ np.append((part.minimum + part.maximum) / 2, 1))[:, :3]
-    likely = np.flatnonzero(likely)
     left = unexplained(before.left, scene, part, found.T_camera_object[likely])
 
-    apart = np.linalg.norm(before.places[None] - centers[likely][:, None], axis=2)
+    apart = np.linalg.norm(before.places[None] - centers[promising][:, None], axis=2)
     new = (apart > reach).all(axis=1).any()
-    return Coverage(left, away, np.concatenate([before.places, centers[likely]]), 0 if new else before.barren + 1)
+    return Coverage(left, away, np.concatenate([before.places, centers[promising]]), 0 if new else before.barren + 1)
 
 
 def unexplained(
@@ -99,7 +102,7 @@ def near_surface(
 def to_search(state: Coverage, scene: Scene, part: Part, patience: int | None) -> Bool[np.ndarray, " r"]:
     """Return the points to spread the next seeds over, without stray ones; none when the search is done.
 
-    After `patience` rounds that found no copy it is not searched finely; None goes on.
+    After `patience` rounds that found nothing promising it is not searched finely; None goes on.
     """
     far = _crowded(state.left & (state.away > SEARCHED * part.diameter), scene, part)
     if far.any() or (patience is not None and state.barren >= patience):

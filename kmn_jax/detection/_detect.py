@@ -69,18 +69,21 @@ class DetectConfig:
     search: SearchConfig = field(default_factory=SearchConfig)
     give_up: bool = True  # on seeds whose first draw has no pose; not where places are given
     many_points: bool = False  # in each draw, and more draws, as always where places are given: `CropSearchConfig`
-    patience: int | None = 2  # rounds that find no copy, after which it is not searched finely; None goes on
+    patience: int | None = 2  # rounds with nothing promising, after which it is not searched finely; None goes on
     later_seeds: int = 16  # at most in a round after the first; rounds go on until the foreground is covered
     most_seeds: int = 512  # at least so many are searched before it is given up to cover the foreground
     likely: float = 0.5  # the probability from which on a pose, as it is found, explains points: they are done
+    promising: float = 0.5  # that from which on such a pose, in a new place, is a reason to go on
     accepted: float = 0.8  # that from which on a pose counts as found: in world bins 95% of such poses are right
     reported: float = 0.1  # less probable poses are left out
 
     def __post_init__(self) -> None:
         if self.patience is not None and self.patience < 1:
             raise InputError(f"patience = {self.patience} must be at least 1, or none")
-        if not 0 <= self.likely <= 1:
-            raise InputError(f"likely = {self.likely} must be a probability")
+        if not 0 <= self.promising <= self.likely <= 1:
+            raise InputError(
+                f"promising = {self.promising} and likely = {self.likely} must be probabilities in this order"
+            )
         if min(self.later_seeds, self.most_seeds) < 1 or not 0 <= self.reported <= self.accepted <= 1:
             raise InputError(
                 f"later_seeds = {self.later_seeds} and most_seeds = {self.most_seeds} must be at least 1, and reported"
@@ -186,8 +189,9 @@ def explore(
             rounds.append(propose(seeds_over(scene, free, part, config.later_seeds if rounds else NUM_SEEDS)))
         with clock("coverage"):
             found = rounds[-1]
-            likely = found.usable & (calibration.probability(found.evidence) >= config.likely)
-            state = cover(state, scene, part, found, likely, reach)
+            probability = np.where(found.usable, calibration.probability(found.evidence), 0)
+            likely, promising = probability >= config.likely, probability >= config.promising
+            state = cover(state, scene, part, found, likely, promising, reach)
             free = to_search(state, scene, part, config.patience)
         if not free.any():
             break

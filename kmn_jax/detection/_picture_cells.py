@@ -17,6 +17,7 @@ from kmn_jax.typing import Pose, Scalar
 _CELLS = 32  # of the grid, along the longer side of the picture
 _SPARE, _WIDE_SPARE = 3, 8  # cells beyond it, on each side, for what is counted and for what a verifier sees
 PICTURE_SIDE, VERIFIER_SIDE = _CELLS + 2 * _SPARE, _CELLS + 2 * _WIDE_SPARE
+PREDICTED_CHANNELS = 0, 3, 10  # of `verifier_cells`: they are the same whatever was measured
 _SAMPLES = ((0.0, 0.0), (-0.3, -0.3), (0.3, -0.3), (-0.3, 0.3), (0.3, 0.3))  # places in a cell, in cells
 # Lengths are in diameters of the object.
 LOOSE = 0.04  # between depths

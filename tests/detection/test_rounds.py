@@ -63,7 +63,9 @@ def answer(scene: Scene, rows: np.ndarray, there: bool) -> Candidates:
     return candidates_of(crops, np.zeros((count, 1, len(EVIDENCE)), np.float32), rows)
 
 
-def rounds(scene: Scene, found_from: int, config: DetectConfig) -> tuple[list[np.ndarray], tuple[str, ...]]:
+def rounds(
+    scene: Scene, found_from: int, config: DetectConfig, calibration: Calibration = SURE
+) -> tuple[list[np.ndarray], tuple[str, ...]]:
     """Return the seeds of each round, of which those before `found_from` find a part at each, and warnings."""
     asked: list[np.ndarray] = []
 
@@ -71,7 +73,7 @@ def rounds(scene: Scene, found_from: int, config: DetectConfig) -> tuple[list[np
         asked.append(scene.points[rows])
         return answer(scene, rows, len(asked) < found_from)
 
-    _, warnings = explore(scene, PART, propose, SURE, config, Clock())
+    _, warnings = explore(scene, PART, propose, calibration, config, Clock())
     return asked, warnings
 
 
@@ -98,6 +100,21 @@ def test_where_nothing_is_found_it_is_searched_coarsely(scene: Scene) -> None:
     assert np.isin(np.concatenate(coarse), np.concatenate(fine)).all()  # it only ends earlier
 
 
+def test_doubtful_poses_are_a_reason_to_go_on_but_cover_nothing(scene: Scene) -> None:
+    doubtful = Calibration(EVIDENCE, (0.0,) * len(EVIDENCE), float(np.log(0.3 / 0.7)))
+    patient, hasty, none, likely = (
+        np.concatenate(rounds(scene, until, config, calibration)[0])
+        for until, config, calibration in (
+            (99, replace(QUICK, promising=0.2), doubtful),
+            (99, QUICK, doubtful),
+            (0, QUICK, doubtful),
+            (99, QUICK, SURE),
+        )
+    )
+    assert len(hasty) == len(none) < len(patient)
+    assert len(likely) < len(patient)
+
+
 def test_a_search_that_is_given_up_says_so(scene: Scene) -> None:
     asked, found = rounds(scene, 0, DetectConfig(most_seeds=40, later_seeds=5))
     assert [len(seeds) for seeds in asked] == [NUM_SEEDS, 5, 5]
@@ -117,7 +134,8 @@ def test_seeds_are_no_more_than_asked_for_or_needed(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    "values", [{"most_seeds": 0}, {"later_seeds": 0}, {"reported": 0.9}, {"likely": 1.5}, {"patience": 0}]
+    "values",
+    [{"most_seeds": 0}, {"later_seeds": 0}, {"reported": 0.9}, {"likely": 1.5}, {"promising": 0.6}, {"patience": 0}],
 )
 def test_contradictory_values_are_refused(values: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(values))):
@@ -126,7 +144,8 @@ def test_contradictory_values_are_refused(values: dict[str, float]) -> None:
 
 def test_points_know_whether_a_seed_is_near(scene: Scene) -> None:
     rows = np.array([0, len(scene.points) // 2])
-    state = cover(nothing_covered(scene), scene, PART, answer(scene, rows, False), np.zeros(2, dtype=bool), 0.1)
+    none = np.zeros(2, dtype=bool)
+    state = cover(nothing_covered(scene), scene, PART, answer(scene, rows, False), none, none, 0.1)
     away = np.linalg.norm(scene.points[:, None] - scene.points[rows][None], axis=2).min(axis=1)
     for share in (SEARCHED, SEARCHED_FINELY):
         np.testing.assert_array_equal(

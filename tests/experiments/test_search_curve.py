@@ -31,7 +31,8 @@ def test_settings_differ_in_what_their_names_say() -> None:
         points = points or [base.search.crops.num_points]
         assert (crops.num_draws, crops.num_points) == (draws[0], points[0])
         patience = {"patience 4": 4, "all finely": None}.get(name.split(", ")[-1], base.patience)
-        assert replace(config, search=base.search) == replace(base, patience=patience)
+        promising = [float(number) for number in re.findall(r"goes on from ([\d.]+)", name)] or [base.promising]
+        assert replace(config, search=base.search) == replace(base, patience=patience, promising=promising[0])
 
 
 def test_a_setting_is_what_is_searched_with(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,11 +7,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from experiments import train_verifier as module
 from experiments.train_verifier import Options, fitted, log_odds_of, train_verifier
+from kmn_jax.detection import PREDICTED_CHANNELS
 from kmn_jax.errors import InputError
 from kmn_jax.models import VERIFIER_CHANNELS, load_verifier
 from kmn_jax.report import markdown_table
@@ -63,6 +65,21 @@ def test_pictures_are_turned_as_wholes() -> None:
     }
     wanted = {np.rot90(one, turns).tobytes() for one in (cells, cells[::-1]) for turns in range(4)}
     assert found == wanted
+
+
+def test_what_was_measured_is_spoiled_in_half_of_the_pictures() -> None:
+    cells = jnp.ones((48, 48, VERIFIER_CHANNELS))
+    spoiled = np.asarray(jax.vmap(module._spoiled, in_axes=(None, 0))(cells, jax.random.split(jax.random.key(0), 200)))
+    measured = np.delete(spoiled, PREDICTED_CHANNELS, axis=-1)
+    assert (spoiled[..., PREDICTED_CHANNELS] == 1).all()
+    assert (measured == measured[..., :1]).all()
+    lost = measured[..., 0] == 0
+    assert 0.4 < lost.any(axis=(1, 2)).mean() < 0.6
+    heights, widths = lost.any(axis=2).sum(axis=1), lost.any(axis=1).sum(axis=1)
+    np.testing.assert_array_equal(lost.sum(axis=(1, 2)), heights * widths)  # rectangles
+    for sizes in (heights, widths):
+        assert sizes.max() in (23, 24, 25)
+        assert len(np.unique(sizes)) > 15  # at the edges of the picture smaller ones
 
 
 def test_how_well_it_does_is_told() -> None:
