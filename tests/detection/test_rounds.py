@@ -142,6 +142,11 @@ def test_contradictory_values_are_refused(values: dict[str, float]) -> None:
         DetectConfig(**values)  # type: ignore[arg-type]
 
 
+def test_what_is_likely_is_promising() -> None:
+    assert DetectConfig(likely=0.3).least_promising == 0.3
+    assert DetectConfig(likely=0.3, promising=0.1).least_promising == 0.1
+
+
 def test_points_know_whether_a_seed_is_near(scene: Scene) -> None:
     rows = np.array([0, len(scene.points) // 2])
     none = np.zeros(2, dtype=bool)

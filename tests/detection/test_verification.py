@@ -12,6 +12,7 @@ import pytest
 
 from kmn_jax.detection import (
     EVIDENCE,
+    PREDICTED_CHANNELS,
     VERIFIED,
     VERIFIER_SIDE,
     CropSearchConfig,
@@ -85,6 +86,7 @@ def test_what_is_beyond_the_outline_is_seen_up_to_the_edge_of_the_image() -> Non
     depth[:, : int(CAMERA.cx)] = 0
     half = cells_of(T, depth)
     assert (half[..., IN_IMAGE] == whole[..., IN_IMAGE]).all()
+    np.testing.assert_array_equal(half[..., PREDICTED_CHANNELS], whole[..., PREDICTED_CHANNELS])
     assert 0.3 < half[..., THERE].sum() / whole[..., THERE].sum() < 0.7
     assert (half[..., TOWARD][half[..., THERE] == 0] == 0).all()
     aside = cells_of(pose((-1.4, 0.0, 3.0)), np.full_like(depth, 3.0 * PART.diameter))  # of half a width at the left
