@@ -30,7 +30,8 @@ def test_settings_differ_in_what_their_names_say() -> None:
         points = [int(number.replace(",", "")) for number in re.findall(r"([\d,]+) points", name)]
         points = points or [base.search.crops.num_points]
         assert (crops.num_draws, crops.num_points) == (draws[0], points[0])
-        patience = {"patience 4": 4, "all finely": None}.get(name.split(", ")[-1], base.patience)
+        rounds = [int(number) for number in re.findall(r"patience (\d+)", name)] or [base.patience]
+        patience = None if "all finely" in name else rounds[0]
         promising = [float(number) for number in re.findall(r"goes on from ([\d.]+)", name)] or [base.promising]
         assert replace(config, search=base.search) == replace(base, patience=patience, promising=promising[0])
 
