@@ -27,6 +27,7 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Literal, get_args
 
 import numpy as np
 import tyro
@@ -47,7 +48,7 @@ from experiments.test_sets import (
     verdict,
 )
 from experiments.training_parts import PARTS_SEED, TRAINING_FAMILIES
-from experiments.worlds import COMPOUND, TEST, TRAINING, VALIDATION, VERIFIER, build_worlds
+from experiments.worlds import COMPOUND, TEST, TRAINING, VALIDATION, VERIFIER, Recipe, build_worlds
 from kmn_jax.data import Pack, PackConfig, PackedObject, Record, Source, build_pack
 from kmn_jax.errors import InputError
 from kmn_jax.simulate import PERFECT, BinScene, SensorConfig
@@ -62,6 +63,14 @@ SMALL_PACK = (
     "Package_TO_SOT_SMD.3dshapes/TSOT-23",
 )
 SMALL_TEST_SET = ("Connector_USB.3dshapes/USB_A_TE_292303-7_Horizontal", "gear_motor")
+WorldSet = Literal["training", "verifier", "compound", "validation", "test"]
+WORLDS: dict[WorldSet, Recipe] = {
+    "training": TRAINING,
+    "verifier": VERIFIER,
+    "compound": COMPOUND,
+    "validation": VALIDATION,
+    "test": TEST,
+}
 
 
 @dataclass(frozen=True)
@@ -157,16 +166,13 @@ class ValidationBins:
 class Worlds:
     """Build the world bins and compare their digests with the recorded ones."""
 
+    sets: tuple[WorldSet, ...] = get_args(WorldSet)
     folder: Path = OUTPUTS / "worlds"
     workers: int | None = None
     record: bool = False  # write the digests into the repository instead
 
     def run(self) -> None:
-        known = {"training": TRAINING, "verifier": VERIFIER, "compound": COMPOUND}
-        recipes = known | {"validation": VALIDATION, "test": TEST}
-        digests = {
-            f"worlds_{name}": build_worlds(self.folder / name, own, self.workers) for name, own in recipes.items()
-        }
+        digests = {f"worlds_{name}": build_worlds(self.folder / name, WORLDS[name], self.workers) for name in self.sets}
         report_digests(digests, self.record)
 
 

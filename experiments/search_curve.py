@@ -45,7 +45,7 @@ SETTINGS = {
     "fast, patience 4": replace(FAST, patience=4),
     "fast, all finely": replace(FAST, patience=None),
     PLAIN: _USUAL,
-    "patience 3": replace(_USUAL, patience=3),
+    "patience 2": replace(_USUAL, patience=2),
     "goes on from 0.2": replace(_USUAL, promising=0.2),
     "goes on from 0.1": replace(_USUAL, promising=0.1),
     "four draws": _with_crops(_USUAL, num_draws=4),

@@ -69,7 +69,7 @@ class DetectConfig:
     search: SearchConfig = field(default_factory=SearchConfig)
     give_up: bool = True  # on seeds whose first draw has no pose; not where places are given
     many_points: bool = False  # in each draw, and more draws, as always where places are given: `CropSearchConfig`
-    patience: int | None = 2  # rounds with nothing promising, after which it is not searched finely; None goes on
+    patience: int | None = 3  # rounds with nothing promising, after which it is not searched finely; None goes on
     later_seeds: int = 16  # at most in a round after the first; rounds go on until the foreground is covered
     most_seeds: int = 512  # at least so many are searched before it is given up to cover the foreground
     likely: float = 0.5  # the probability from which on a pose, as it is found, explains points: they are done
