@@ -17,6 +17,7 @@ from kmn_jax.objects import Part
 EXPLAINED = 0.05  # points so near to the surface of a found part are done
 SEARCHED = 0.5  # those so near to a seed
 SEARCHED_FINELY = 0.2  # the same, as long as rounds find new copies
+AMONG = 1.0  # points so near to the centre of a promising pose are searched finely
 _CELL = 0.4  # points are stray if few others lie in their cell
 _LEAST_CROWD = 16  # points of a cell: fewer make no crop
 _SURFACE_POINTS = 1024  # on a part
@@ -102,12 +103,23 @@ def near_surface(
 def to_search(state: Coverage, scene: Scene, part: Part, patience: int | None) -> Bool[np.ndarray, " r"]:
     """Return the points to spread the next seeds over, without stray ones; none when the search is done.
 
-    After `patience` rounds that found nothing promising it is not searched finely; None goes on.
+    It is searched finely among promising poses, as copies lie among copies, or all over while there is none, but no
+    more after `patience` rounds that found nothing promising; None searches all over, and goes on.
     """
     far = _crowded(state.left & (state.away > SEARCHED * part.diameter), scene, part)
     if far.any() or (patience is not None and state.barren >= patience):
         return far
-    return _crowded(state.left & (state.away > SEARCHED_FINELY * part.diameter), scene, part)
+    fine = state.left & (state.away > SEARCHED_FINELY * part.diameter)
+    if patience is not None and len(state.places):
+        fine[fine] = _near_places(state, scene.points[fine], AMONG * part.diameter)
+    return _crowded(fine, scene, part)
+
+
+def _near_places(state: Coverage, points: Float[np.ndarray, "n 3"], reach: float) -> Bool[np.ndarray, " n"]:
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(state.places).query(points, distance_upper_bound=reach)
+    return np.isfinite(distance)
 
 
 def _crowded(chosen: Bool[np.ndarray, " r"], scene: Scene, part: Part) -> Bool[np.ndarray, " r"]:

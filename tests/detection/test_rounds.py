@@ -23,11 +23,14 @@ from kmn_jax.detection import (
     seeds_over,
 )
 from kmn_jax.detection._coverage import (
+    AMONG,
     SEARCHED,
     SEARCHED_FINELY,
+    _crowded,
     cover,
     near_surface,
     nothing_covered,
+    to_search,
     unexplained,
 )
 from kmn_jax.detection._detect import narrowing
@@ -157,6 +160,22 @@ def test_points_know_whether_a_seed_is_near(scene: Scene) -> None:
             (state.away > share * DIAMETER)[state.left], (away > share * DIAMETER)[state.left]
         )
     assert 0 < (state.away[state.left] > SEARCHED * DIAMETER).mean() < 1
+
+
+def test_it_is_searched_finely_among_promising_poses_or_everywhere(scene: Scene) -> None:
+    part = replace(PART, diameter=0.5)
+    everywhere = nothing_covered(scene)
+    everywhere = everywhere._replace(away=np.full_like(everywhere.away, 0.3 * part.diameter))
+    assert SEARCHED_FINELY < 0.3 < SEARCHED
+    place = scene.points[[0]].astype(np.float64)
+    among = everywhere._replace(places=place)
+    near = np.linalg.norm(scene.points - place, axis=1) < AMONG * part.diameter
+    assert 0.01 < near.mean() < 0.9
+    np.testing.assert_array_equal(to_search(among, scene, part, 3), _crowded(near, scene, part))
+    for state, patience in ((everywhere, 3), (among, None)):
+        np.testing.assert_array_equal(to_search(state, scene, part, patience), _crowded(everywhere.left, scene, part))
+    for state in (everywhere, among):
+        assert not to_search(state._replace(barren=3), scene, part, 3).any()
 
 
 def test_what_lies_on_no_pose_is_unexplained(scene: Scene) -> None:
