@@ -57,7 +57,7 @@ class Request:
     plane: Literal["auto", "always", "never"] = "auto"
     """Whether to leave out the largest plane, what is behind it, and a bin's walls; auto: if larger than the object."""
     effort: Literal["fast", "usual", "thorough"] = "usual"
-    """fast: three quarters of the time, and perhaps a few copies fewer; thorough: some four times, and a few more."""
+    """fast: seven tenths of the time, and fewer copies; thorough: some seven times, and perhaps a few more."""
     sensor: str | None = None
     """X,Y,Z of the sensor in the scene's frame; the origin unless given."""
     base_camera: Path | None = None
