@@ -91,7 +91,8 @@ def _forget() -> None:
 
 def pytest_xdist_auto_num_workers() -> int:
     """One more than there are cores: some tests wait for servers, browsers and commands."""
-    return (os.cpu_count() or 1) + 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return (cores or 1) + 1
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
