@@ -89,12 +89,6 @@ def _forget() -> None:
     gc.collect()  # what programs are in may be in cycles
 
 
-def pytest_xdist_auto_num_workers() -> int:
-    """One more than there are cores: some tests wait for servers, browsers and commands."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return (cores or 1) + 1
-
-
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: place(item.path))
     has_torch = importlib.util.find_spec("torch") is not None

@@ -20,13 +20,12 @@ OPTIMISED = (
     "models/test_released.py",
     "ros/test_results.py",
 )
-# The longest first. Training comes second and third, so that of three workers one compiles the search, and the others
-# read it later.
+# The longest first. Training comes second, so that with two workers one compiles the search and the other reads it.
 LONGEST = (
     OPTIMISED[0],
     "train/test_loop.py",
-    "train/test_sharding.py",
     *OPTIMISED[1:],
+    "train/test_sharding.py",
     "detection/test_crop_search.py",
     "pose/test_ransac.py",
     "models/test_keymatchnet.py",
