@@ -27,7 +27,7 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 import tyro
@@ -166,7 +166,7 @@ class ValidationBins:
 class Worlds:
     """Build the world bins and compare their digests with the recorded ones."""
 
-    sets: tuple[WorldSet, ...] = get_args(WorldSet)
+    sets: tuple[WorldSet, ...] = tuple(WORLDS)
     folder: Path = OUTPUTS / "worlds"
     workers: int | None = None
     record: bool = False  # write the digests into the repository instead

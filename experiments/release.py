@@ -211,7 +211,7 @@ def _card(
 
 def poses_section(detections: list[dict[str, Any]]) -> str:
     """Return how many copies of whole bins are found and how exactly, of what detection wrote; empty without any."""
-    rows = [row for found in detections for row in _whole(found["detection"])]
+    rows = [row for found in detections for row in whole_rows(found["detection"])]
     if not rows:
         return ""
     table = [
@@ -232,8 +232,8 @@ def poses_section(detections: list[dict[str, Any]]) -> str:
     return f"## Poses in whole bins\n\n{_POSES}\n\n{markdown_table(table)}\n\nBy {' and '.join(commands)}."
 
 
-def _whole(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows that are neither of one object nor of one family."""
+def whole_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows of detection's results that are neither of one object nor of one family."""
     return [row for row in rows if row["bins"] == _ALL] or [row for row in rows if ":" not in row["bins"]]
 
 

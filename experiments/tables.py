@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from experiments.release import whole_rows
 from experiments.search_curve import PLAIN
 from kmn_jax.errors import InputError
 from kmn_jax.files import write_whole
@@ -20,9 +21,9 @@ ROOT = Path(__file__).parents[1]
 DOCS = ("README.md", "docs/detect.md")
 _RESULTS = ROOT / "experiments" / "results"
 _OURS = "kmn_jax"
-_OTHERS = (
-    "[other scenes](docs/detect.md#outside-of-these-bins): tables, trays, thick rims, mixed parts, other sensors",
-    "other scenes",
+_OTHERS = "other scenes"
+_OTHERS_IN_SHORT = (
+    "[other scenes](docs/detect.md#outside-of-these-bins): tables, trays, thick rims, mixed parts, other sensors"
 )
 _SEARCHES = {
     "fast: one draw": "fast",
@@ -58,24 +59,22 @@ Row = dict[str, Any]
 def tables() -> dict[str, list[list[str]]]:
     """Return the rows of tables, by the first line of each table. Raises InputError if a result lacks one."""
     worlds, bins, searches = (_result(name) for name in ("worlds_test", "detection", "search_curve"))
-    scenes = worlds["detection"]
-    own = [row for row in bins["detection"] if row["method"] == _OURS and ":" not in row["bins"]]
-    (together,) = (row for row in scenes if row["bins"] == "all")
+    own, (together,) = whole_rows(bins["detection"]), whole_rows(worlds["detection"])
     by_name = {row["search"]: row for row in searches["settings"]}
     missing = [name for name in _SEARCHES.values() if name not in by_name]
     if missing:
         raise InputError(f"the search curve was made without {missing[0]!r}: see docs/detect.md for its command")
     return {
-        _IN_SHORT: [_in_short(name, row) for name, row in _named(own, together, _OTHERS[0])],
+        _IN_SHORT: [_in_short(name, row) for name, row in _named(own, together, _OTHERS_IN_SHORT)],
         _BINS: [_of_bins(row) for row in own],
-        _EXACTNESS: [_exactness(name, row) for name, row in _named(own, together, _OTHERS[1])],
-        _WORLDS: [_of_worlds(row) for row in scenes],
+        _EXACTNESS: [_exactness(name, row) for name, row in _named(own, together, _OTHERS)],
+        _WORLDS: [_of_worlds(row) for row in worlds["detection"]],
         _CURVE: [_of_search(text, by_name[name]) for text, name in _SEARCHES.items()],
     }
 
 
 def rewritten(text: str, rows_of: dict[str, list[list[str]]]) -> str:
-    """Return a text with rows of its tables in place of those that begin as they do, up to where they hold numbers.
+    """Return a text with rows of its tables in place of those that have the same name, and, where it is ours, method.
 
     Other rows of a table, such as those of another method, stay. Raises InputError if a table has no such row.
     """

@@ -111,15 +111,8 @@ def to_search(state: Coverage, scene: Scene, part: Part, patience: int | None) -
         return far
     fine = state.left & (state.away > SEARCHED_FINELY * part.diameter)
     if patience is not None and len(state.places):
-        fine[fine] = _near_places(state, scene.points[fine], AMONG * part.diameter)
+        fine[fine] = near_surface(scene.points[fine], state.places, np.eye(4)[None], AMONG * part.diameter)
     return _crowded(fine, scene, part)
-
-
-def _near_places(state: Coverage, points: Float[np.ndarray, "n 3"], reach: float) -> Bool[np.ndarray, " n"]:
-    from scipy.spatial import cKDTree
-
-    distance, _ = cKDTree(state.places).query(points, distance_upper_bound=reach)
-    return np.isfinite(distance)
 
 
 def _crowded(chosen: Bool[np.ndarray, " r"], scene: Scene, part: Part) -> Bool[np.ndarray, " r"]:
