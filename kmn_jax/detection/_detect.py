@@ -73,27 +73,20 @@ class DetectConfig:
     later_seeds: int = 16  # at most in a round after the first; rounds go on until the foreground is covered
     most_seeds: int = 512  # at least so many are searched before it is given up to cover the foreground
     likely: float = 0.5  # the probability from which on a pose, as it is found, explains points: they are done
-    promising: float | None = None  # that from which on such a pose, in a new place, is a reason to go on; none: likely
+    promising: float = 0.1  # that from which on such a pose, in a new place, is a reason to go on, as likely ones are
     accepted: float = 0.8  # that from which on a pose counts as found: in world bins 95% of such poses are right
     reported: float = 0.1  # less probable poses are left out
 
     def __post_init__(self) -> None:
         if self.patience is not None and self.patience < 1:
             raise InputError(f"patience = {self.patience} must be at least 1, or none")
-        if not 0 <= self.least_promising <= self.likely <= 1:
-            raise InputError(
-                f"promising = {self.promising} and likely = {self.likely} must be probabilities in this order"
-            )
+        if not (0 <= self.promising <= 1 and 0 <= self.likely <= 1):
+            raise InputError(f"promising = {self.promising} and likely = {self.likely} must be probabilities")
         if min(self.later_seeds, self.most_seeds) < 1 or not 0 <= self.reported <= self.accepted <= 1:
             raise InputError(
                 f"later_seeds = {self.later_seeds} and most_seeds = {self.most_seeds} must be at least 1, and reported"
                 f" = {self.reported} and accepted = {self.accepted} probabilities in this order"
             )
-
-    @property
-    def least_promising(self) -> float:
-        """The probability from which on a pose is promising."""
-        return self.likely if self.promising is None else self.promising
 
     def search_of(self, config: KeyMatchNetConfig, at_places: bool = False) -> SearchConfig:
         """Return how is searched with a network: around seeds all over the scene, or at places that are given."""
@@ -195,7 +188,8 @@ def explore(
         with clock("coverage"):
             found = rounds[-1]
             probability = np.where(found.usable, calibration.probability(found.evidence), 0)
-            likely, promising = probability >= config.likely, probability >= config.least_promising
+            likely = probability >= config.likely
+            promising = likely | (probability >= config.promising)
             state = cover(state, scene, part, found, likely, promising, reach)
             free = to_search(state, scene, part, config.patience)
         if not free.any():

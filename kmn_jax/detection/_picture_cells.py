@@ -161,9 +161,12 @@ def _slope(
 ) -> tuple[Float[Array, "s s 3"], Bool[Array, "s s"]]:
     """Return the way from cell to cell along an axis, where both are on one surface."""
     ways, known = [], []
+    size = there.shape[axis]
+    place = jnp.arange(size, dtype=jnp.int32).reshape((-1, 1) if axis == 0 else (1, -1))
     for step in (-1, 1):
         way = step * (points - jnp.roll(points, step, axis))
-        same = there & jnp.roll(there, step, axis) & (jnp.abs(way[..., 2]) < reach)
+        has_next = (place >= step) & (place < size + step)  # cells roll around at the edge of the grid
+        same = there & jnp.roll(there, step, axis) & has_next & (jnp.abs(way[..., 2]) < reach)
         ways.append(jnp.where(same[..., None], way, 0))
         known.append(same)
     return ways[0] + ways[1], known[0] | known[1]

@@ -108,8 +108,8 @@ def test_doubtful_poses_are_a_reason_to_go_on_but_cover_nothing(scene: Scene) ->
     patient, hasty, none, likely = (
         np.concatenate(rounds(scene, until, config, calibration)[0])
         for until, config, calibration in (
-            (99, replace(QUICK, promising=0.2), doubtful),
             (99, QUICK, doubtful),
+            (99, replace(QUICK, promising=0.5), doubtful),
             (0, QUICK, doubtful),
             (99, QUICK, SURE),
         )
@@ -138,16 +138,11 @@ def test_seeds_are_no_more_than_asked_for_or_needed(scene: Scene) -> None:
 
 @pytest.mark.parametrize(
     "values",
-    [{"most_seeds": 0}, {"later_seeds": 0}, {"reported": 0.9}, {"likely": 1.5}, {"promising": 0.6}, {"patience": 0}],
+    [{"most_seeds": 0}, {"later_seeds": 0}, {"reported": 0.9}, {"likely": 1.5}, {"promising": -0.1}, {"patience": 0}],
 )
 def test_contradictory_values_are_refused(values: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(values))):
         DetectConfig(**values)  # type: ignore[arg-type]
-
-
-def test_what_is_likely_is_promising() -> None:
-    assert DetectConfig(likely=0.3).least_promising == 0.3
-    assert DetectConfig(likely=0.3, promising=0.1).least_promising == 0.1
 
 
 def test_points_know_whether_a_seed_is_near(scene: Scene) -> None:

@@ -29,6 +29,7 @@ from kmn_jax.detection import (
 )
 from kmn_jax.detection import _detect as detecting
 from kmn_jax.detection import _verification as module
+from kmn_jax.detection._picture_cells import measured, predicted
 from kmn_jax.detection._search import no_poses
 from kmn_jax.geometry import intrinsics
 from kmn_jax.models import VERIFIER_CHANNELS, create_verifier, verify
@@ -181,3 +182,20 @@ def _image() -> DepthImage:
 def _on_device() -> DevicePart:
     arrays = PartArrays(SURFELS.points, SURFELS.normals, jnp.zeros((len(PART.points), 1)), jnp.float32(PART.diameter))
     return DevicePart(arrays, SURFELS, jnp.eye(4)[None], jnp.float32(0.1), jnp.eye(4)[None], jnp.zeros(1, bool))
+
+
+def test_normals_at_the_edge_of_the_picture_are_those_of_the_surface() -> None:
+    """All that is seen is a large ball, whose opposite sides are as far away: no slope may reach across the picture."""
+    radius, away = 4.0, 10.0
+    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
+    rays = np.stack([(columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy, np.ones(rows.shape)], axis=-1)
+    squared = (rays**2).sum(axis=-1)
+    inside = away**2 - squared * (away**2 - radius**2)
+    depth = np.where(inside > 0, (away - np.sqrt(np.maximum(inside, 0))) / squared, 0).astype(np.float32)
+    image = DepthImage(jnp.asarray(depth), intrinsics(CAMERA))
+    seen = predicted(jnp.asarray(pose((0.0, 0.0, away - radius)), dtype=jnp.float32), SURFELS, image)
+    found = measured(seen, image, jnp.float32(PART.diameter))
+    outward = np.asarray(found.points) - (0, 0, away)
+    cosines = (outward / radius * np.asarray(found.normals)).sum(axis=-1)
+    assert found.has_normal.all()
+    assert cosines.min() > 0.99  # 0.966 where they do
