@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from pathlib import Path
+from threading import Lock
 from typing import Any, cast
 from zipfile import BadZipFile
 
@@ -59,6 +60,7 @@ _COLUMNS = (  # of what is stored
 _HOW = 8  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
 _IN_MEMORY = 600  # searches, of each of which what was found first, crops and all, takes 10 MB
 _AT_ONCE = 2  # searches: one alone leaves a part of two cores idle
+_READING = Lock()  # NumPy parses the headers of arrays, which CPython 3.11 sometimes refuses two threads at once
 
 
 def poses_to_fit(sources: Sources, fits: FitOptions, network: Model, stored: Path | None = None) -> Columns:
@@ -111,7 +113,7 @@ def read_poses(
 
 def _loaded(path: Path) -> Columns:
     try:
-        with np.load(path) as file:
+        with _READING, np.load(path) as file:
             return dict(file)
     except (OSError, EOFError, ValueError, TypeError, BadZipFile) as error:
         raise InputError(f"{path} holds no poses ({shown(error)}): remove it") from None
