@@ -27,9 +27,8 @@ _OTHERS_IN_SHORT = (
 )
 _SEARCHES = {
     "fast: one draw": "fast",
-    "rounds end after two with nothing new, `DetectConfig(patience=2)`": "patience 2",
+    "it goes on for poses of 0.5, `DetectConfig(promising=0.5)`": "goes on from 0.5",
     "usual: up to two draws, and three such rounds": PLAIN,
-    "poses from 0.1 on are new, `DetectConfig(promising=0.1)`": "goes on from 0.1",
     "up to four draws": "four draws",
     "thorough": "thorough",
 }
