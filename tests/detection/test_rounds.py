@@ -105,17 +105,19 @@ def test_where_nothing_is_found_it_is_searched_coarsely(scene: Scene) -> None:
 
 def test_doubtful_poses_are_a_reason_to_go_on_but_cover_nothing(scene: Scene) -> None:
     doubtful = Calibration(EVIDENCE, (0.0,) * len(EVIDENCE), float(np.log(0.3 / 0.7)))
-    patient, hasty, none, likely = (
+    patient, hasty, none, likely, barely_likely = (
         np.concatenate(rounds(scene, until, config, calibration)[0])
         for until, config, calibration in (
             (99, QUICK, doubtful),
             (99, replace(QUICK, promising=0.5), doubtful),
             (0, QUICK, doubtful),
             (99, QUICK, SURE),
+            (99, replace(QUICK, likely=0.2, promising=0.5), doubtful),
         )
     )
     assert len(hasty) == len(none) < len(patient)
     assert len(likely) < len(patient)
+    np.testing.assert_array_equal(barely_likely, likely)  # what is likely is a reason to go on, too
 
 
 def test_a_search_that_is_given_up_says_so(scene: Scene) -> None:
