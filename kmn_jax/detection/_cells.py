@@ -73,7 +73,7 @@ def places_of(depth: Float[Array, "s s"]) -> tuple[Float[Array, "s s"], Float[Ar
     return columns, rows
 
 
-def _around(values: Shaped[Array, "s s ..."], reach: int, fill: float | bool) -> list[Shaped[Array, "s s ..."]]:
+def around(values: Shaped[Array, "s s ..."], reach: int, fill: float | bool) -> list[Shaped[Array, "s s ..."]]:
     """Return an image shifted by up to so many cells along its first axis."""
     rest = [(0, 0)] * (values.ndim - 1)
     padded = jnp.pad(values, [(reach, reach), *rest], constant_values=fill)
@@ -87,7 +87,7 @@ def _along_both(
     join: Callable[[Shaped[Array, "k s s ..."]], Shaped[Array, "s s ..."]],
 ) -> Shaped[Array, "s s ..."]:
     for _ in range(2):
-        values = jnp.swapaxes(join(jnp.stack(_around(values, reach, fill))), 0, 1)
+        values = jnp.swapaxes(join(jnp.stack(around(values, reach, fill))), 0, 1)
     return values
 
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from kmn_jax.detection._cells import around
 from kmn_jax.detection._depth_agreement import DepthImage, depth_at, in_image
 from kmn_jax.geometry import transform_points
 from kmn_jax.models import VERIFIER_CHANNELS
@@ -160,13 +161,11 @@ def _slope(
     points: Float[Array, "s s 3"], there: Bool[Array, "s s"], axis: int, reach: Scalar
 ) -> tuple[Float[Array, "s s 3"], Bool[Array, "s s"]]:
     """Return the way from cell to cell along an axis, where both are on one surface."""
+    points, there = (jnp.swapaxes(grid, 0, axis) for grid in (points, there))
+    (before, _, after), (is_before, _, is_after) = around(points, 1, 0.0), around(there, 1, False)
     ways, known = [], []
-    size = there.shape[axis]
-    place = jnp.arange(size, dtype=jnp.int32).reshape((-1, 1) if axis == 0 else (1, -1))
-    for step in (-1, 1):
-        way = step * (points - jnp.roll(points, step, axis))
-        has_next = (place >= step) & (place < size + step)  # cells roll around at the edge of the grid
-        same = there & jnp.roll(there, step, axis) & has_next & (jnp.abs(way[..., 2]) < reach)
+    for way, is_beside in ((after - points, is_after), (points - before, is_before)):
+        same = there & is_beside & (jnp.abs(way[..., 2]) < reach)
         ways.append(jnp.where(same[..., None], way, 0))
         known.append(same)
-    return ways[0] + ways[1], known[0] | known[1]
+    return jnp.swapaxes(ways[0] + ways[1], 0, axis), jnp.swapaxes(known[0] | known[1], 0, axis)
