@@ -10,7 +10,7 @@ from configs.normalization import normalization_metric, normalization_released
 from configs.paper import paper, paper_tenth, paper_worlds
 from configs.per_object import per_object
 from configs.small import small, worlds, worlds_long
-from configs.variants import LONG, VARIANTS
+from configs.variants import FEW, LONG, VARIANTS
 from kmn_jax.errors import InputError
 from kmn_jax.train._config import TrainConfig
 
@@ -26,6 +26,7 @@ CONFIGS: dict[str, TrainConfig] = {
         worlds,
         worlds_long,
         *VARIANTS,
+        *FEW,
         *LONG,
         per_object,
         normalization_metric,

@@ -73,6 +73,22 @@ VARIANTS = (
 )
 
 
+def _few(name: str, **changes: object) -> TrainConfig:
+    few = replace(_variant(name, **changes), name=f"few_{name}", num_steps=3_000, crops_at_once=1, average_decay=0.998)
+    return replace(few, pipeline=replace(few.pipeline, batch_size=16))
+
+
+_FEW = _few("reference")
+
+FEW = (
+    _FEW,
+    replace(_FEW, name="few_spread", loss=replace(_FEW.loss, keypoint_spread=0.07)),
+    _few("coarse", num_coarse_points=64),
+    _few("coarse_attention", num_coarse_points=64, attention="scene"),
+    _few("attention", num_coarse_points=64, attention="both"),
+)
+
+
 def _long(of: TrainConfig, name: str) -> TrainConfig:
     return replace(
         of,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +9,9 @@ from jaxtyping import Float, Float64, Int
 
 _TRIPLES = 1000  # of points, each of which may lie in the plane: one of a fifth of the points gets 8 of them
 _SAMPLE = 5000  # points by which planes are compared
+_FEW = 1000  # of these, by which all are compared at first
+_BEST = 50  # planes of most points there, which go on
 _REFINEMENTS = 3
-_CHUNK = 100  # planes at a time
 _NEAR = 64  # neighbours in the sample, of which a local triple is made
 
 
@@ -51,19 +51,22 @@ def dominant_plane(
     normals, corner = normals[proper] / length[proper, None], corners[proper, 0]
     offsets = (normals * corner).sum(axis=1)
 
-    def counts_of(start: int) -> Int[np.ndarray, " c"]:
-        some = slice(start, start + _CHUNK)
-        away = normals[some] @ sample.T
-        away -= offsets[some, None]
-        near = np.abs(away, out=away) <= margin
-        return np.array([np.count_nonzero(row) for row in near])  # many times as fast as a sum
-
-    with ThreadPoolExecutor(2) as pool:  # NumPy lets others run as it counts
-        counts = np.concatenate(list(pool.map(counts_of, range(0, len(normals), _CHUNK))))
-    best = int(counts.argmax())
+    few = sample[:: -(-len(sample) // _FEW)]
+    promising = np.sort(np.argsort(-_counts(few, normals, offsets, margin), kind="stable")[:_BEST])
+    best = int(promising[_counts(sample, normals[promising], offsets[promising], margin).argmax()])
     found = fitted_plane(everything, normals[best], float(offsets[best]), margin)
     offset = found.offset + float(found.normal @ center)
     return Plane(found.normal, offset) if offset >= 0 else Plane(-found.normal, -offset)
+
+
+def _counts(
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "t 3"], offsets: Float[np.ndarray, " t"], margin: float
+) -> Int[np.ndarray, " t"]:
+    """Return how many points lie nearer to each plane than `margin`."""
+    away = normals @ points.T
+    away -= offsets[:, None]
+    near = np.abs(away, out=away) <= margin
+    return np.array([np.count_nonzero(row) for row in near])  # many times as fast as a sum
 
 
 def fitted_plane(

@@ -14,7 +14,7 @@ from kmn_jax.models._keymatchnet import (
     model_structure,
 )
 from kmn_jax.models._layers import Compute
-from kmn_jax.models._losses import LossConfig, MatchingLoss, keypoint_labels, matching_loss
+from kmn_jax.models._losses import LossConfig, MatchingLoss, keypoint_labels, matching_loss, spread_labels
 from kmn_jax.models._normalization import released_object, released_scene
 from kmn_jax.models._released import RELEASED_CONFIG, load_released, save_released
 from kmn_jax.models._verifier import (
@@ -66,6 +66,7 @@ __all__ = [
     "save_model",
     "save_released",
     "save_verifier",
+    "spread_labels",
     "verify",
     "with_chiral_inputs",
 ]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal, get_args
 
 from kmn_jax.errors import InputError, require, shown
+from kmn_jax.models._attention import HEADS
 from kmn_jax.models._invariants import Inputs
 from kmn_jax.models._layers import Compute
 from kmn_jax.models._pair_head import PairDropout
@@ -13,6 +14,7 @@ from kmn_jax.models._pair_head import PairDropout
 Graph = Literal["dynamic", "static"]
 Normalization = Literal["metric", "released"]
 ObjectBranch = Literal["cad", "learned"]
+Attends = Literal["none", "scene", "both"]
 
 _CHOICES = {
     "normalization": get_args(Normalization),
@@ -21,10 +23,12 @@ _CHOICES = {
     "graph": get_args(Graph),
     "compute": get_args(Compute),
     "pair_dropout": get_args(PairDropout),
+    "attention": get_args(Attends),
 }
+_LATER = ("num_coarse_points", "attention")  # fields that networks of before do not have
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class KeyMatchNetConfig:
     """Sizes and switches of the network; the defaults are the published ones, but for the input scaling.
 
@@ -40,6 +44,9 @@ class KeyMatchNetConfig:
         object_digest: SHA-256 of that object's CAD file; empty for networks of any object.
         compute: arithmetic of the layers; statistics, distances and logits are float32 in all.
         pair_dropout: one dropout mask for all keypoints of a point ("shared"), or "per_pair" as published.
+        num_coarse_points: scene points that also look farther, and tell all others what they see; none if it is 0.
+        attention: "scene" for attention among the coarse points, in place of their second graph block, "both" for
+            attention of all scene points to the keypoints as well.
     """
 
     num_scene_points: int = 2048
@@ -60,6 +67,8 @@ class KeyMatchNetConfig:
     object_branch: ObjectBranch = "cad"
     object_digest: str = ""
     compute: Compute = "float32"
+    num_coarse_points: int = 0
+    attention: Attends = "none"
 
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
@@ -75,6 +84,17 @@ class KeyMatchNetConfig:
                 raise InputError(f"{name} is {shown(repr(size))}, but must be a whole number, at least 1")
             if name in widths and size % self.groups:
                 raise InputError(f"{name} is {size}, but must be a multiple of groups = {self.groups}")
+        require(
+            isinstance(self.num_coarse_points, int) and self.num_coarse_points >= 0,
+            f"num_coarse_points is {shown(repr(self.num_coarse_points))}, but must be a whole number, at least 0",
+        )
+        if self.attention != "none":
+            require(self.num_coarse_points > 0, f'attention "{self.attention}" needs num_coarse_points above 0')
+            require(
+                self.edge_width % HEADS == self.object_width % HEADS == 0,
+                f"attention needs edge_width = {self.edge_width} and object_width = {self.object_width} to be multiples"
+                f" of its {HEADS} heads",
+            )
         require(0 <= self.dropout < 1, f"dropout is {self.dropout}, but must be in [0, 1)")
         if self.inputs != "raw" and self.normalization == "released":
             raise InputError(
@@ -86,3 +106,10 @@ class KeyMatchNetConfig:
             self.num_keypoints <= self.num_object_points,
             f"{self.num_keypoints} keypoints cannot be drawn from {self.num_object_points} object points",
         )
+
+    def __repr__(self) -> str:
+        """Say all but what networks of before have not, where this one has it neither: so their digests stay."""
+        told = (
+            field for field in fields(self) if field.name not in _LATER or getattr(self, field.name) != field.default
+        )
+        return f"{type(self).__name__}({', '.join(f'{field.name}={getattr(self, field.name)!r}' for field in told)})"

@@ -7,6 +7,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
 from kmn_jax.geometry import k_nearest, neighbor_graph, space_filling_order
+from kmn_jax.models._coarse import CoarseLevel
 from kmn_jax.models._config import KeyMatchNetConfig
 from kmn_jax.models._edgeconv import EdgeConv
 from kmn_jax.models._invariants import LATER_PAIR_CHANNELS, PAIR_CHANNELS, EncoderInputs
@@ -18,18 +19,21 @@ class Encoder(nnx.Module):
 
     The scene encoder keeps every point. The object encoder, given keypoint indices, looks at all points in
     its first block and for the neighbours in its second, but only the keypoints' rows go on; in its third
-    block every keypoint is a neighbour of every other.
+    block every keypoint is a neighbour of every other. A coarse level is of scenes alone.
     """
 
-    def __init__(self, config: KeyMatchNetConfig, channels: int, *, rngs: nnx.Rngs) -> None:
+    def __init__(self, config: KeyMatchNetConfig, channels: int, *, coarse: bool = False, rngs: nnx.Rngs) -> None:
         """Take points of so many `channels`, and features of their pairs as the config says."""
         width, groups = config.edge_width, config.groups
         pairs, later_pairs = PAIR_CHANNELS[config.inputs], LATER_PAIR_CHANNELS[config.inputs]
         self.edge1 = EdgeConv(channels, width, 2, groups, pair_features=pairs, rngs=rngs)
         self.edge2 = EdgeConv(width, width, 2, groups, pair_features=later_pairs, rngs=rngs)
         self.edge3 = EdgeConv(width, width, 1, groups, rngs=rngs)
-        self.embedding = NormalizedLinear(3 * width, config.embedding_width, groups, rngs=rngs)
-        self.out = NormalizedLinear(config.embedding_width + 3 * width, config.scene_width, groups, rngs=rngs)
+        local = 3 * width
+        self.coarse = CoarseLevel(config, local, rngs=rngs) if coarse else None
+        local += 2 * width if coarse else 0
+        self.embedding = NormalizedLinear(local, config.embedding_width, groups, rngs=rngs)
+        self.out = NormalizedLinear(config.embedding_width + local, config.scene_width, groups, rngs=rngs)
         self.num_neighbors = config.num_neighbors
         self.graph = config.graph
         self.chiral = config.inputs == "chiral"
@@ -68,6 +72,8 @@ class Encoder(nnx.Module):
             x2 = self.edge2(x1, graph, compute, centers, edge_mask, self._later_pairs(inputs, graph, keypoint_indices))
             x1, x3, mask = centers, self.edge3.complete_graph(x2, compute), None
         local = jnp.concatenate([x1, x2, x3], axis=1)
+        if self.coarse is not None:
+            local = jnp.concatenate([local, self.coarse(local, inputs, compute, mask)], axis=1)
         features = self._with_global(local, compute, mask)
         return features[places] if keypoint_indices is None else features
 

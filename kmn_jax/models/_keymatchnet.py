@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from kmn_jax.errors import InputError, float_array, index_array, is_traced, mask_array, positive_scalar, row_count
 from kmn_jax.geometry import largest_distance
+from kmn_jax.models._attention import Attention
 from kmn_jax.models._config import KeyMatchNetConfig
 from kmn_jax.models._encoder import Encoder
 from kmn_jax.models._invariants import (
@@ -72,7 +73,7 @@ class KeyMatchNet(nnx.Module):
 
     def __init__(self, config: KeyMatchNetConfig, *, rngs: nnx.Rngs) -> None:
         self.config = config
-        self.scene = Encoder(config, SCENE_CHANNELS[config.inputs], rngs=rngs)
+        self.scene = Encoder(config, SCENE_CHANNELS[config.inputs], coarse=config.num_coarse_points > 0, rngs=rngs)
         if config.object_branch == "cad":
             self.object = Encoder(config, OBJECT_CHANNELS[config.inputs], rngs=rngs)
             self.object_out = NormalizedLinear(config.scene_width, config.object_width, config.groups, rngs=rngs)
@@ -80,6 +81,8 @@ class KeyMatchNet(nnx.Module):
             shape = config.num_keypoints, config.object_width
             self.keypoints = nnx.Param(jax.random.normal(rngs.params(), shape))
         self.head = PairHead(config.scene_width, config.object_width, config.pair_width, config.groups, rngs=rngs)
+        own, other = config.scene_width, config.object_width
+        self.to_object = Attention(own, other, other, config.groups, rngs=rngs) if config.attention == "both" else None
 
     def encode_object(
         self,
@@ -136,6 +139,8 @@ class KeyMatchNet(nnx.Module):
     ) -> tuple[Float[Array, "n 2"], Float[Array, "n k"]]:
         """Return segmentation logits (class 1 = the seed's instance) and keypoint logits, in float32."""
         config = self.config
+        if self.to_object is not None:
+            scene_features = self.to_object(scene_features, object_features, config.compute, mask)
         return self.head(
             scene_features, object_features, config.compute, mask, config.dropout, config.pair_dropout, key
         )

@@ -95,7 +95,7 @@ def save_released(model: tuple[nnx.GraphDef, nnx.State], path: str | Path) -> No
     if suffix not in (*TORCH_SUFFIXES, ".safetensors"):
         raise InputError(f"{path} has no known suffix: use one of {', '.join(TORCH_SUFFIXES)} or .safetensors")
     config = Model(*model).config
-    same = ("normalization", "inputs", "graph", "object_branch", "num_neighbors", "groups")
+    same = ("normalization", "inputs", "graph", "object_branch", "num_neighbors", "groups", "num_coarse_points")
     other = [name for name in same if getattr(config, name) != getattr(RELEASED_CONFIG, name)]
     if other:
         switches = ", ".join(f"{name} = {getattr(config, name)}" for name in other)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from kmn_jax.data import DevicePack, SampleIndex
 from kmn_jax.errors import InputError
-from kmn_jax.models import KeyMatchNetConfig, LossConfig, MatchingLoss, create_model, matching_loss
+from kmn_jax.models import KeyMatchNetConfig, LossConfig, MatchingLoss, create_model, matching_loss, spread_labels
 from kmn_jax.train._examples import ExampleConfig, Group, RenderedCrops, make_group
 from kmn_jax.typing import PRNGKey
 
@@ -160,10 +160,11 @@ def sum_gradients(
         def summed(
             parameters: nnx.State, features: Float[Array, "c k o"], part: _Part
         ) -> tuple[Float[Array, ""], Sums]:
-            sums = _part_sums(graphdef, parameters, config.loss, features, groups.length, part)
+            sums = _part_sums(graphdef, parameters, config.loss, features, groups.length, part, shares)
             return sums.loss, sums
 
         features, pull = jax.vjp(encode, parameters)
+        shares = _label_shares(groups, config.loss)
         gradient = jax.grad(summed, argnums=(0, 1), has_aux=True)
         (own, of_features), sums = _summed(
             lambda part: gradient(parameters, features, part), _parts(groups, chunk, crop_keys, config)
@@ -277,6 +278,19 @@ def _encode_objects(
     return jax.vmap(network.encode_object)(groups.cloud, groups.keypoint_indices, groups.length, keys)
 
 
+def _label_shares(groups: Group, config: LossConfig) -> Float[Array, "c k k"] | None:
+    """Return which shares keypoints have in each other as labels; None if each label is one of them."""
+    if config.keypoint_spread == 0:
+        return None
+
+    def of_group(
+        cloud: Float[Array, "m 6"], indices: Int[Array, " k"], length: Float[Array, ""]
+    ) -> Float[Array, "k k"]:
+        return spread_labels(cloud[indices, :3] / length, config.keypoint_spread)
+
+    return jax.vmap(of_group)(groups.cloud, groups.keypoint_indices, groups.length)
+
+
 def _part_sums(
     graphdef: nnx.GraphDef,
     parameters: nnx.State,
@@ -284,21 +298,24 @@ def _part_sums(
     features: Float[Array, "c k o"],
     lengths: Float[Array, " c"],
     part: _Part,
+    shares: Float[Array, "c k k"] | None = None,
 ) -> Sums:
     network = nnx.merge(graphdef, parameters)
     # Crops that do not count may have no points, of which a maximum and its gradient are not finite: their padding is
     # taken for points.
     part = part._replace(mask=part.mask | (part.weight == 0)[..., None])
 
-    def of_group(features: Float[Array, "k o"], length: Float[Array, ""], part: _Part) -> MatchingLoss:
+    def of_group(
+        features: Float[Array, "k o"], length: Float[Array, ""], part: _Part, shares: Float[Array, "k k"] | None
+    ) -> MatchingLoss:
         def one(crop, mask, is_object, keypoint, key):  # type: ignore[no-untyped-def]
             scene = network.encode_scene(crop, length, mask)
             segmentation, keypoints = network.match(scene, features, mask, key)
-            return matching_loss(segmentation, keypoints, is_object, keypoint, mask, config)
+            return matching_loss(segmentation, keypoints, is_object, keypoint, mask, config, shares)
 
         return jax.vmap(one)(part.crops, part.mask, part.is_object, part.keypoint, part.dropout)
 
-    result = jax.vmap(of_group)(features, lengths, part)
+    result = jax.vmap(of_group)(features, lengths, part, shares)
     points, object_points = (
         part.weight * count.astype(jnp.float32) for count in (result.num_points, result.num_object_points)
     )

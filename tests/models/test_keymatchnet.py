@@ -72,11 +72,21 @@ def test_forward_is_the_dense_one(seed: int) -> None:
     assert_close(logits(model, crop, cloud), [np.asarray(x) for x in want])
 
 
-@pytest.mark.parametrize("inputs", ["raw", "invariant", "chiral"])
-@pytest.mark.parametrize("real", [200, 30, 5])
-def test_padded_crop_equals_the_unpadded_one(inputs: str, real: int) -> None:
-    """5 real points are fewer than the 8 neighbours asked for."""
-    model = small_model(normalization="metric", inputs=inputs)
+def coarse(attention: str) -> dict[str, object]:
+    return {"num_coarse_points": 24, "attention": attention}
+
+
+@pytest.mark.parametrize(
+    ("inputs", "real", "changes"),
+    [
+        *((inputs, real, {}) for inputs in ("raw", "invariant", "chiral") for real in (200, 30, 5)),
+        ("raw", 5, coarse("none")),
+        *(("chiral", real, coarse("both")) for real in (30, 2)),
+    ],
+)
+def test_padded_crop_equals_the_unpadded_one(inputs: str, real: int, changes: dict) -> None:
+    """5 real points are fewer than the 8 neighbours asked for, 2 than the 3 coarse points that tell each other one."""
+    model = small_model(normalization="metric", inputs=inputs, **changes)
     crop, cloud = scene_crop(1, 300), box_cloud(11, 280)
     crop[real:] = np.nan
     mask = np.arange(300) < real
@@ -103,8 +113,9 @@ def test_released_normalisation_ignores_padding_too() -> None:
     assert_close([x[:250] for x in got], logits(model, crop[:250], cloud))
 
 
-def test_vmap_equals_one_by_one() -> None:
-    model = small_model()
+@pytest.mark.parametrize("changes", [{}, coarse("both")], ids=["fine", "coarse"])
+def test_vmap_equals_one_by_one(changes: dict) -> None:
+    model = small_model(**changes)
     crops = jnp.stack([jnp.asarray(scene_crop(seed, 200)) for seed in range(4)])
     masks = jnp.arange(200)[None, :] < jnp.array([200, 150, 100, 180])[:, None]
     part = encode_object(model, box_cloud(3, 280), KEYPOINTS, 50.0)
@@ -139,18 +150,25 @@ def test_object_length_defaults_to_its_diameter() -> None:
     np.testing.assert_array_equal(part.keypoints, cloud[KEYPOINTS])
 
 
-@pytest.mark.parametrize("inputs", ["invariant", "chiral"])
-def test_invariant_inputs_do_not_know_the_rotation(inputs: str) -> None:
-    model = small_model(inputs=inputs)
-    crop, cloud = scene_crop(7, 200), box_cloud(17, 280)
+def rotated(x: np.ndarray) -> np.ndarray:
     rotation, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
     rotation = (rotation * np.sign(np.linalg.det(rotation))).astype(np.float32)
+    return np.concatenate([x[:, :3] @ rotation.T, x[:, 3:] @ rotation.T], axis=1)
 
-    def rotated(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([x[:, :3] @ rotation.T, x[:, 3:] @ rotation.T], axis=1)
 
-    static = small_model(inputs=inputs, graph="static")
-    assert_close(logits(static, rotated(crop), rotated(cloud), 50.0), logits(static, crop, cloud, 50.0), 1e-3)
+@pytest.mark.parametrize(
+    "changes", [{"inputs": "invariant"}, {"inputs": "chiral"}, {"inputs": "chiral"} | coarse("both")]
+)
+def test_invariant_inputs_do_not_know_the_rotation(changes: dict) -> None:
+    model = small_model(graph="static", **changes)
+    crop, cloud = scene_crop(7, 200), box_cloud(17, 280)
+    assert_close(logits(model, rotated(crop), rotated(cloud), 50.0), logits(model, crop, cloud, 50.0), 1e-3)
+
+
+@pytest.mark.parametrize("inputs", ["invariant", "chiral"])
+def test_invariant_inputs_hardly_know_the_rotation_in_a_dynamic_graph(inputs: str) -> None:
+    model = small_model(inputs=inputs)
+    crop, cloud = scene_crop(7, 200), box_cloud(17, 280)
     a, b = logits(model, rotated(crop), rotated(cloud), 50.0), logits(model, crop, cloud, 50.0)
     assert (np.abs(a[0] - b[0]) < 1e-2 * np.ptp(b[0])).mean() > 0.98  # a feature-space near-tie may flip
 
@@ -181,9 +199,13 @@ def test_bfloat16_stays_close() -> None:
         assert np.sqrt(np.mean((a - b) ** 2)) < 0.02 * np.ptp(b)
 
 
-@pytest.mark.parametrize("pair_dropout", ["shared", "per_pair"])
-def test_training_forward_has_finite_keyed_gradients(pair_dropout: str) -> None:
-    model = small_model(pair_dropout=pair_dropout)
+@pytest.mark.parametrize(
+    "changes",
+    [{"pair_dropout": "shared"}, {"pair_dropout": "per_pair"}, {"inputs": "chiral"} | coarse("both")],
+    ids=str,
+)
+def test_training_forward_has_finite_keyed_gradients(changes: dict) -> None:
+    model = small_model(**changes)
     crop, cloud = jnp.asarray(scene_crop(10, 150)), jnp.asarray(box_cloud(20, 160))
     length = jnp.float32(50)
 
@@ -218,6 +240,11 @@ def test_parameter_count_is_the_published_one() -> None:
         ({"dropout": 1.0}, r"in \[0, 1\)"),
         ({"inputs": "invariant", "normalization": "released"}, 'need normalization "metric"'),
         ({"num_keypoints": 50, "num_object_points": 40}, "cannot be drawn"),
+        ({"num_coarse_points": -1}, "at least 0"),
+        ({"num_coarse_points": 2.5}, "whole number"),
+        ({"attention": "object", "num_coarse_points": 8}, "one of none, scene, both"),
+        ({"attention": "scene"}, "needs num_coarse_points above 0"),
+        ({"attention": "both", "num_coarse_points": 8, "object_width": 30, "groups": 2}, "multiples of its 4 heads"),
     ],
 )
 def test_contradictory_configs_are_refused(changes: dict, message: str) -> None:

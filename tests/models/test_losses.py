@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kmn_jax.models import LossConfig, keypoint_labels, matching_loss
+from kmn_jax.errors import InputError
+from kmn_jax.models import LossConfig, keypoint_labels, matching_loss, spread_labels
 
 
 def reference(segmentation, keypoint, on_object, labels):
@@ -87,3 +88,28 @@ def test_padding_reaches_neither_loss_nor_gradient() -> None:
     broken = jnp.where(mask[:, None], keypoint, jnp.nan)
     np.testing.assert_allclose(total(broken), total(keypoint), rtol=1e-6)
     np.testing.assert_allclose(jax.grad(total)(broken), jax.grad(total)(keypoint), atol=1e-7)
+
+
+def test_spread_labels_are_shared_by_keypoints_as_near_as_they_are() -> None:
+    keypoints = jnp.asarray(np.random.default_rng(0).normal(size=(7, 3)), "f4")
+    shares = np.asarray(spread_labels(keypoints, 0.5))
+    np.testing.assert_allclose(shares.sum(axis=1), 1, rtol=1e-6)
+    gap = np.linalg.norm(keypoints[2] - keypoints[5])
+    np.testing.assert_allclose(shares[2, 5] / shares[2, 2], np.exp(-(gap**2) / (2 * 0.5**2)), rtol=1e-4)
+    np.testing.assert_allclose(spread_labels(keypoints, 1e-3), np.eye(7), atol=1e-6)
+
+
+def test_loss_with_shares_is_the_mean_of_losses_with_labels() -> None:
+    segmentation, keypoint, on_object, _ = map(jnp.asarray, example(7))
+    shares = spread_labels(jnp.asarray(np.random.default_rng(1).normal(size=(7, 3)), "f4"), 1.0)
+    label = jnp.full(60, 3, dtype=jnp.int32)
+    got = matching_loss(segmentation, keypoint, on_object, label, shares=shares)
+    each = [matching_loss(segmentation, keypoint, on_object, label * 0 + other).keypoint for other in range(7)]
+    np.testing.assert_allclose(got.keypoint, (np.asarray(shares[3]) * np.asarray(each)).sum(), rtol=1e-5)
+    same = matching_loss(segmentation, keypoint, on_object, label)
+    assert float(got.keypoint_accuracy) == float(same.keypoint_accuracy)
+
+
+def test_labels_cannot_be_spread_less_than_not_at_all() -> None:
+    with pytest.raises(InputError, match=r"keypoint_spread = -0\.1"):
+        LossConfig(keypoint_spread=-0.1)
