@@ -84,7 +84,6 @@ FEW = (
     _FEW,
     replace(_FEW, name="few_spread", loss=replace(_FEW.loss, keypoint_spread=0.07)),
     _few("coarse", num_coarse_points=64),
-    _few("coarse_attention", num_coarse_points=64, attention="scene"),
     _few("attention", num_coarse_points=64, attention="both"),
 )
 

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import jax
@@ -250,6 +250,14 @@ def test_parameter_count_is_the_published_one() -> None:
 def test_contradictory_configs_are_refused(changes: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         KeyMatchNetConfig.__post_init__(SimpleNamespace(**(asdict(KeyMatchNetConfig()) | changes)))
+
+
+def test_networks_of_before_are_called_what_they_were_called() -> None:
+    """Digests of networks are of what their configs are called."""
+    assert repr(KeyMatchNetConfig(num_keypoints=7)).endswith("object_digest='', compute='float32')")
+    some, more = (KeyMatchNetConfig(num_coarse_points=count, attention="scene") for count in (16, 32))
+    assert repr(some).endswith("compute='float32', num_coarse_points=16, attention='scene')")
+    assert repr(more) != repr(some) != repr(replace(some, attention="both"))
 
 
 def test_bad_input_gets_one_clear_error() -> None:

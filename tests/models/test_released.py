@@ -91,7 +91,9 @@ def test_round_trip_to_the_authors_form(
 
 
 def test_own_format_round_trip(tmp_path: Path) -> None:
-    config = KeyMatchNetConfig(edge_width=32, inputs="invariant", num_keypoints=40)
+    config = KeyMatchNetConfig(
+        edge_width=32, inputs="invariant", num_keypoints=40, num_coarse_points=16, attention="both"
+    )
     model = create_model(config, jax.random.key(0))
     path = tmp_path / "model.safetensors"
     save_model(model, path)
@@ -102,7 +104,7 @@ def test_own_format_round_trip(tmp_path: Path) -> None:
 
 
 def test_only_what_the_authors_code_has_is_written_in_its_form(tmp_path: Path) -> None:
-    for changes in ({"graph": "static"}, {"num_neighbors": 10}, {"normalization": "metric"}):
+    for changes in ({"graph": "static"}, {"num_neighbors": 10}, {"normalization": "metric"}, {"num_coarse_points": 4}):
         config = replace(RELEASED_CONFIG, **changes)
         with pytest.raises(InputError, match=f"something else .* {next(iter(changes))}"):
             save_released(create_model(config, jax.random.key(0)), tmp_path / "a.pt")
