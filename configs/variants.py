@@ -74,7 +74,7 @@ VARIANTS = (
 
 
 def _few(name: str, **changes: object) -> TrainConfig:
-    few = replace(_variant(name, **changes), name=f"few_{name}", num_steps=3_000, crops_at_once=1, average_decay=0.998)
+    few = replace(_variant(name, **changes), name=f"few_{name}", num_steps=2_000, crops_at_once=1, average_decay=0.998)
     return replace(few, pipeline=replace(few.pipeline, batch_size=16))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,9 +10,9 @@ from jaxtyping import Float, Float64, Int
 
 _TRIPLES = 1000  # of points, each of which may lie in the plane: one of a fifth of the points gets 8 of them
 _SAMPLE = 5000  # points by which planes are compared
-_FEW = 1000  # of these, by which all are compared at first
-_BEST = 50  # planes of most points there, which go on
 _REFINEMENTS = 3
+_CHUNK = 100  # planes at a time
+_ROUNDED = 16  # points that single precision may put on the other side of a margin
 _NEAR = 64  # neighbours in the sample, of which a local triple is made
 
 
@@ -51,9 +52,9 @@ def dominant_plane(
     normals, corner = normals[proper] / length[proper, None], corners[proper, 0]
     offsets = (normals * corner).sum(axis=1)
 
-    few = sample[:: -(-len(sample) // _FEW)]
-    promising = np.sort(np.argsort(-_counts(few, normals, offsets, margin), kind="stable")[:_BEST])
-    best = int(promising[_counts(sample, normals[promising], offsets[promising], margin).argmax()])
+    rough = _counts(sample.astype(np.float32), normals.astype(np.float32), offsets.astype(np.float32), margin)
+    most = np.flatnonzero(rough >= rough.max() - _ROUNDED)
+    best = int(most[_counts(sample, normals[most], offsets[most], margin).argmax()])
     found = fitted_plane(everything, normals[best], float(offsets[best]), margin)
     offset = found.offset + float(found.normal @ center)
     return Plane(found.normal, offset) if offset >= 0 else Plane(-found.normal, -offset)
@@ -62,11 +63,17 @@ def dominant_plane(
 def _counts(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "t 3"], offsets: Float[np.ndarray, " t"], margin: float
 ) -> Int[np.ndarray, " t"]:
-    """Return how many points lie nearer to each plane than `margin`."""
-    away = normals @ points.T
-    away -= offsets[:, None]
-    near = np.abs(away, out=away) <= margin
-    return np.array([np.count_nonzero(row) for row in near])  # many times as fast as a sum
+    """Return how many points are not farther from each plane than `margin`."""
+
+    def counts_of(start: int) -> Int[np.ndarray, " c"]:
+        some = slice(start, start + _CHUNK)
+        away = normals[some] @ points.T
+        away -= offsets[some, None]
+        near = np.abs(away, out=away) <= margin
+        return np.array([np.count_nonzero(row) for row in near])  # many times as fast as a sum
+
+    with ThreadPoolExecutor(2) as pool:  # NumPy lets others run as it counts
+        return np.concatenate(list(pool.map(counts_of, range(0, len(normals), _CHUNK))))
 
 
 def fitted_plane(
