@@ -20,7 +20,7 @@ import jax
 import tyro
 
 from experiments.evaluation.cases import Method, ObjectImages, limited
-from experiments.evaluation.configs import CONFIGS, OWN_NETWORKS, EvaluateConfig, find_config
+from experiments.evaluation.configs import CONFIGS, CROPS_AGAIN, OWN_NETWORKS, EvaluateConfig, find_config
 from experiments.evaluation.methods import ONE_RANSAC, Ours, OwnNetworks
 from experiments.evaluation.predictions import Export, check_files, export
 from experiments.evaluation.refinement import SETTINGS
@@ -124,6 +124,7 @@ def _methods(config: EvaluateConfig, model: Model, networks: Path | None) -> tup
     makers: dict[str, Callable[[], Method]] = {
         "ours": lambda: Ours("kmn_jax", model),
         "ours_ransac": lambda: Ours("kmn_jax, one RANSAC", model, ONE_RANSAC),
+        CROPS_AGAIN: lambda: Ours("kmn_jax, one RANSAC, crops again", model, ONE_RANSAC, crops_again=True),
         "ours_no_normals": lambda: Ours("kmn_jax, one RANSAC, no normal check", model, unchecked),
         "ours_open3d": lambda: Ours("kmn_jax, Open3D RANSAC", model, ONE_RANSAC, search=OverMatches()),
         OWN_NETWORKS: lambda: OwnNetworks("kmn_jax, trained for the object", _own_networks(networks)),

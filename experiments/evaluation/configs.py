@@ -41,6 +41,8 @@ METHODS = (
     "ours", "ours_ransac", "ours_no_normals", "ours_open3d", "fpfh", "fpfh_best", "fgr", "ppf", "ppf_best", "kiss"
 )  # fmt: skip
 OWN_NETWORKS = "per_object"  # a method, too, for which networks have to be given
+CROPS_AGAIN = "ours_again"  # one, too: a second crop around the middle of the first one's pose
+_NAMED = (OWN_NETWORKS, CROPS_AGAIN)  # methods that are run only where they are named
 
 
 def noise_name(noise: float) -> str:
@@ -81,8 +83,8 @@ class EvaluateConfig:
         if not self.methods:
             raise InputError(f"no method is named: there are {', '.join(METHODS)}")
         for name in self.methods:
-            if name not in (*METHODS, OWN_NETWORKS):
-                raise InputError(f"there is no method {name!r}: there are {', '.join(METHODS)} and {OWN_NETWORKS}")
+            if name not in (*METHODS, *_NAMED):
+                raise InputError(f"there is no method {name!r}: there are {', '.join((*METHODS, *_NAMED))}")
         names = {noise_name(level) for level in self.noise}  # of columns; files are named alike
         if len({*self.methods}) < len(self.methods) or len(names) < len(self.noise):
             raise InputError("a method or a noise is named twice")

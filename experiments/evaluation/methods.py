@@ -53,6 +53,7 @@ class Ours:
     config: CropSearchConfig = field(default_factory=CropSearchConfig)
     num_keypoints: int | None = None
     search: Callable[[Matches, float, int], Float[np.ndarray, "4 4"] | None] | None = None  # see `rivals`
+    crops_again: bool = False  # around the point that is nearest to the middle of the first pose, which it replaces
 
     @property
     def settings(self) -> Mapping[str, Any]:
@@ -64,11 +65,18 @@ class Ours:
         }
         if self.search is not None:
             own["other search"] = getattr(self.search, "settings", {})
+        if self.crops_again:
+            own["crops again"] = True
         return {"network": asdict(self.model.config), **own}
 
     def prepare(self, model: ObjectModel) -> Solver:
         """Encode an object; solving covers drawing, normals, network, matches and search."""
         arrays, config = arrays_of(self.model, self.part(model)), self.config.of_network(self.model.config)
+
+        def around(case: Case, row: int) -> Float[np.ndarray, "4 4"] | None:
+            found = jax.device_get(poses_at(self.model, arrays, padded(case.points), row, case.random_seed, config))
+            best = found.poses.T_scene_object[0]
+            return np.asarray(best, dtype=np.float64) if found.poses.converged[0] else None
 
         def solve(case: Case) -> Float[np.ndarray, "4 4"] | None:
             if self.search is not None:
@@ -76,9 +84,14 @@ class Ours:
                 matches: Matches = jax.device_get(_matches(prediction, arrays, config.matches))
                 pose = self.search(matches, float(model.diameter), case.random_seed)
                 return None if pose is None else _moved(pose, np.asarray(crop.seed))
-            found = jax.device_get(poses_at(self.model, arrays, padded(case.points), 0, case.random_seed, config))
-            best = found.poses.T_scene_object[0]
-            return np.asarray(best, dtype=np.float64) if found.poses.converged[0] else None
+            first = around(case, 0)
+            if first is None or not self.crops_again:
+                return first
+            middle = np.asarray(arrays.points, dtype=np.float64).mean(axis=0)
+            cloud = padded(case.points)
+            away = np.linalg.norm(np.asarray(cloud.points) - (first[:3, :3] @ middle + first[:3, 3])[None], axis=1)
+            again = around(case, int(np.where(np.asarray(cloud.mask), away, np.inf).argmin()))
+            return first if again is None else again
 
         return solve
 
