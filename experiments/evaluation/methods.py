@@ -67,7 +67,7 @@ class Ours:
             own["other search"] = getattr(self.search, "settings", {})
         if self.crops_again:
             own["crops again"] = True
-        return {"network": asdict(self.model.config), **own}
+        return {"network": self.model.config.told(), **own}
 
     def prepare(self, model: ObjectModel) -> Solver:
         """Encode an object; solving covers drawing, normals, network, matches and search."""

@@ -12,7 +12,7 @@ _TRIPLES = 1000  # of points, each of which may lie in the plane: one of a fifth
 _SAMPLE = 5000  # points by which planes are compared
 _REFINEMENTS = 3
 _CHUNK = 100  # planes at a time
-_ROUNDED = 16  # points that single precision may put on the other side of a margin
+_ROUNDED = 16  # points: by as many fewer in single precision, a plane may still be the one of most
 _NEAR = 64  # neighbours in the sample, of which a local triple is made
 
 

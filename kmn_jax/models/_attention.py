@@ -45,11 +45,13 @@ class Attention(nnx.Module):
             product(rows, kernel[...], compute).reshape(len(rows), HEADS, -1)
             for rows, kernel in ((x, self.query), (others, self.key), (others, self.value))
         )
-        bias = None
+        precision = jax.lax.Precision.HIGHEST if compute == "float32" else jax.lax.Precision.DEFAULT
+        fit = jnp.einsum("nhd,mhd->hnm", query, key, precision=precision).astype(jnp.float32)
+        fit = fit / jnp.sqrt(jnp.float32(query.shape[2]))
         if self.pair is not None and pair_features is not None:
-            bias = jnp.moveaxis(product(pair_features, self.pair[...], compute), 2, 0).astype(query.dtype)
-        with jax.default_matmul_precision("highest" if compute == "float32" else "default"):
-            seen = jax.nn.dot_product_attention(
-                query, key, value, bias, None if others_mask is None else others_mask[None, None, :]
-            )
+            fit = fit + jnp.moveaxis(product(pair_features, self.pair[...], compute), 2, 0).astype(jnp.float32)
+        if others_mask is not None:
+            fit = jnp.where(others_mask[None, None, :], fit, -jnp.inf)
+        share = jax.nn.softmax(fit, axis=2).astype(value.dtype)
+        seen = jnp.einsum("hnm,mhd->nhd", share, value, precision=precision)
         return (x + self.out(seen.reshape(len(x), -1), compute, mask)).astype(x.dtype)

@@ -17,13 +17,18 @@ from kmn_jax.models._keymatchnet import Model, model_structure
 def with_chiral_inputs(model: Model) -> Model:
     """Return a network of "chiral" inputs that answers as one of "invariant" inputs does, to go on training it.
 
-    The new inputs are multiplied by zeros. Raises InputError for a network of other inputs, or of learned features.
+    The new inputs are multiplied by zeros. Raises InputError for a network of other inputs, of learned features, or
+    with a coarse level.
     """
     config = model.config
     if config.inputs != "invariant" or config.object_branch != "cad":
         raise InputError(
             f'a network of "{config.inputs}" inputs and a "{config.object_branch}" object branch cannot be given'
             ' chiral inputs: only one of "invariant" inputs and CAD features can'
+        )
+    if config.num_coarse_points:
+        raise InputError(
+            "a network with a coarse level cannot be given chiral inputs: train one from random parameters"
         )
     grown = model_structure(replace(config, inputs="chiral"))
     parameters = nnx.to_pure_dict(model.parameters)

@@ -45,7 +45,7 @@ class CoarseLevel(nnx.Module):
     ) -> Float[Array, "n w"]:
         """Return what the coarse level knows at each point."""
         rows = farthest_point_indices(inputs.xyz, min(self.num_points, len(features)), mask=mask)
-        total = len(features) if mask is None else mask.sum(dtype=jnp.int32)
+        total = len(features) if mask is None else jnp.maximum(mask.sum(dtype=jnp.int32), 1)
         there = jnp.arange(len(rows)) < total
         few = inputs.rows(rows)
 

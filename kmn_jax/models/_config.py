@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from kmn_jax.errors import InputError, require, shown
 from kmn_jax.models._attention import HEADS
@@ -14,7 +14,7 @@ from kmn_jax.models._pair_head import PairDropout
 Graph = Literal["dynamic", "static"]
 Normalization = Literal["metric", "released"]
 ObjectBranch = Literal["cad", "learned"]
-Attends = Literal["none", "scene", "both"]
+AttentionKind = Literal["none", "scene", "both"]
 
 _CHOICES = {
     "normalization": get_args(Normalization),
@@ -23,9 +23,9 @@ _CHOICES = {
     "graph": get_args(Graph),
     "compute": get_args(Compute),
     "pair_dropout": get_args(PairDropout),
-    "attention": get_args(Attends),
+    "attention": get_args(AttentionKind),
 }
-_LATER = ("num_coarse_points", "attention")  # fields that networks of before do not have
+_SINCE = ("num_coarse_points", "attention")  # fields that networks of before do not have
 
 
 @dataclass(frozen=True, repr=False)
@@ -68,7 +68,7 @@ class KeyMatchNetConfig:
     object_digest: str = ""
     compute: Compute = "float32"
     num_coarse_points: int = 0
-    attention: Attends = "none"
+    attention: AttentionKind = "none"
 
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
@@ -91,9 +91,9 @@ class KeyMatchNetConfig:
         if self.attention != "none":
             require(self.num_coarse_points > 0, f'attention "{self.attention}" needs num_coarse_points above 0')
             require(
-                self.edge_width % HEADS == self.object_width % HEADS == 0,
-                f"attention needs edge_width = {self.edge_width} and object_width = {self.object_width} to be multiples"
-                f" of its {HEADS} heads",
+                self.edge_width % HEADS == 0 and (self.attention == "scene" or self.object_width % HEADS == 0),
+                f"attention needs edge_width = {self.edge_width}, and to the object also object_width ="
+                f" {self.object_width}, to be multiples of its {HEADS} heads",
             )
         require(0 <= self.dropout < 1, f"dropout is {self.dropout}, but must be in [0, 1)")
         if self.inputs != "raw" and self.normalization == "released":
@@ -107,9 +107,16 @@ class KeyMatchNetConfig:
             f"{self.num_keypoints} keypoints cannot be drawn from {self.num_object_points} object points",
         )
 
+    def told(self) -> dict[str, Any]:
+        """Return all fields but those that networks of before do not have, where this one goes without, too.
+
+        So these networks' files and digests stay what they were.
+        """
+        return {
+            field.name: getattr(self, field.name)
+            for field in fields(self)
+            if field.name not in _SINCE or getattr(self, field.name) != field.default
+        }
+
     def __repr__(self) -> str:
-        """Say all but what networks of before have not, where this one has it neither: so their digests stay."""
-        told = (
-            field for field in fields(self) if field.name not in _LATER or getattr(self, field.name) != field.default
-        )
-        return f"{type(self).__name__}({', '.join(f'{field.name}={getattr(self, field.name)!r}' for field in told)})"
+        return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in self.told().items())})"

@@ -12,6 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import nearest, squared_distances
 
+_LEAST_SPREAD, _MOST_SPREAD = 0.001, 10.0
+
 
 @dataclass(frozen=True)
 class LossConfig:
@@ -25,8 +27,10 @@ class LossConfig:
         weights = (self.segmentation_weight, self.keypoint_weight)
         if min(weights) < 0 or max(weights) <= 0:
             raise InputError(f"loss weights are {weights}, but none may be negative and one must be above zero")
-        if self.keypoint_spread < 0:
-            raise InputError(f"keypoint_spread = {self.keypoint_spread} must be at least 0")
+        if self.keypoint_spread != 0 and not _LEAST_SPREAD <= self.keypoint_spread <= _MOST_SPREAD:
+            raise InputError(
+                f"keypoint_spread = {self.keypoint_spread} must be 0, or from {_LEAST_SPREAD} to {_MOST_SPREAD}"
+            )
 
 
 class MatchingLoss(NamedTuple):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -24,7 +23,7 @@ _CONFIG_KEY = "kmn_jax.config"
 
 def save_model(model: tuple[nnx.GraphDef, nnx.State], path: str | Path) -> None:
     """Write parameters and config to a .safetensors file."""
-    config = json.dumps(dataclasses.asdict(Model(*model).config))
+    config = json.dumps(Model(*model).config.told())
     write_whole(path, parameters_bytes(model[1], {_CONFIG_KEY: config}))
 
 

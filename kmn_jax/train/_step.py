@@ -153,6 +153,7 @@ def sum_gradients(
     def of_chunk(chunk: _Chunk) -> tuple[nnx.State, Sums]:
         groups = _make(pack, chunk, config, config.examples)
         object_keys, crop_keys = _dropout_keys(chunk.dropout, config.crops_per_object)
+        shares = _label_shares(groups, config.loss)
 
         def encode(parameters: nnx.State) -> Float[Array, "c k o"]:
             return _encode_objects(graphdef, parameters, groups, object_keys)
@@ -164,7 +165,6 @@ def sum_gradients(
             return sums.loss, sums
 
         features, pull = jax.vjp(encode, parameters)
-        shares = _label_shares(groups, config.loss)
         gradient = jax.grad(summed, argnums=(0, 1), has_aux=True)
         (own, of_features), sums = _summed(
             lambda part: gradient(parameters, features, part), _parts(groups, chunk, crop_keys, config)

@@ -156,6 +156,21 @@ def test_one_wall_alone_is_not_taken_away() -> None:
     assert off_walls(wall, None, False, MARGIN, LONG).all()
 
 
+@pytest.mark.parametrize("local", [False, True])
+def test_the_plane_of_most_points_is_that_of_an_exact_count(local: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Single precision only says which planes are counted exactly; if all of them are, it is the same one."""
+    for seed in range(3):
+        generator = np.random.default_rng(seed)
+        points = np.concatenate([bin_points(generator), balls(generator)])
+        found = dominant_plane(points, MARGIN, seed, local)
+        with monkeypatch.context() as patch:
+            patch.setattr("kmn_jax.detection._planes._ROUNDED", len(points))
+            exact = dominant_plane(points, MARGIN, seed, local)
+        assert found is not None and exact is not None
+        np.testing.assert_array_equal(found.normal, exact.normal)
+        assert found.offset == exact.offset
+
+
 def test_local_triples_find_small_planes() -> None:
     generator = np.random.default_rng(5)
     small = rectangle(generator, (-30, -30, AWAY), (30, 30, AWAY))

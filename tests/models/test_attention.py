@@ -37,6 +37,14 @@ def test_rows_see_all_others_as_their_queries_fit_keys(pairs: jnp.ndarray | None
     np.testing.assert_allclose(made(x, others, "float32", pair_features=pairs), want, atol=2e-6)
 
 
+def test_few_bits_stay_close() -> None:
+    made, x, others, pairs = attention(5), rows(1, 30, 24), rows(2, 7, 10), rows(3, 30, 7, 5)
+    want = made(x, others, "float32", pair_features=pairs)
+    got = made(x.astype(jnp.bfloat16), others.astype(jnp.bfloat16), "bfloat16", pair_features=pairs)
+    assert got.dtype == jnp.bfloat16
+    assert float(jnp.sqrt(((got.astype(jnp.float32) - want) ** 2).mean())) < 0.02 * float(jnp.ptp(want))
+
+
 def test_padding_is_neither_seen_nor_counted() -> None:
     made, x, others = attention(), rows(1, 30, 24), rows(2, 7, 10)
     want = made(x[:20], others[:4], "float32")

@@ -67,3 +67,5 @@ def test_other_networks_cannot_be_given_chiral_inputs() -> None:
     learned = KeyMatchNetConfig(**SMALL, inputs="invariant", object_branch="learned")
     with pytest.raises(InputError, match='"learned" object branch'):
         with_chiral_inputs(create_model(learned, jax.random.key(0)))
+    with pytest.raises(InputError, match="a coarse level cannot be given chiral inputs"):
+        with_chiral_inputs(small_model(inputs="invariant", num_coarse_points=8))

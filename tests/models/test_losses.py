@@ -110,6 +110,7 @@ def test_loss_with_shares_is_the_mean_of_losses_with_labels() -> None:
     assert float(got.keypoint_accuracy) == float(same.keypoint_accuracy)
 
 
-def test_labels_cannot_be_spread_less_than_not_at_all() -> None:
-    with pytest.raises(InputError, match=r"keypoint_spread = -0\.1"):
-        LossConfig(keypoint_spread=-0.1)
+@pytest.mark.parametrize("spread", [-0.1, 1e-20, 1e200, float("nan")])
+def test_labels_are_spread_over_lengths_that_an_object_has(spread: float) -> None:
+    with pytest.raises(InputError, match=r"keypoint_spread = .* must be 0, or from 0\.001 to 10"):
+        LossConfig(keypoint_spread=spread)
