@@ -166,7 +166,8 @@ def test_the_plane_of_most_points_is_that_of_an_exact_count(local: bool, monkeyp
         with monkeypatch.context() as patch:
             patch.setattr("kmn_jax.detection._planes._ROUNDED", len(points))
             exact = dominant_plane(points, MARGIN, seed, local)
-        assert found is not None and exact is not None
+        assert found is not None
+        assert exact is not None
         np.testing.assert_array_equal(found.normal, exact.normal)
         assert found.offset == exact.offset
 
