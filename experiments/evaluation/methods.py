@@ -20,12 +20,13 @@ from kmn_jax.detection import (
     draw_of_crop,
     matches_of,
     network_prediction,
+    placed,
     poses_at,
     predict,
     seed_crop,
 )
 from kmn_jax.errors import InputError
-from kmn_jax.geometry import Crop
+from kmn_jax.geometry import Crop, PaddedCloud
 from kmn_jax.models import Model
 from kmn_jax.objects import ObjectModel, Part, PartArrays, arrays_of, make_part, model_digest
 from kmn_jax.pose import MatchConfig, Matches, RansacConfig
@@ -73,8 +74,10 @@ class Ours:
         """Encode an object; solving covers drawing, normals, network, matches and search."""
         arrays, config = arrays_of(self.model, self.part(model)), self.config.of_network(self.model.config)
 
-        def around(case: Case, row: int) -> Float[np.ndarray, "4 4"] | None:
-            found = jax.device_get(poses_at(self.model, arrays, padded(case.points), row, case.random_seed, config))
+        middle = np.asarray(arrays.points, dtype=np.float64).mean(axis=0)
+
+        def around(cloud: PaddedCloud, row: int, random_seed: int) -> Float[np.ndarray, "4 4"] | None:
+            found = jax.device_get(poses_at(self.model, arrays, cloud, row, random_seed, config))
             best = found.poses.T_scene_object[0]
             return np.asarray(best, dtype=np.float64) if found.poses.converged[0] else None
 
@@ -84,13 +87,12 @@ class Ours:
                 matches: Matches = jax.device_get(_matches(prediction, arrays, config.matches))
                 pose = self.search(matches, float(model.diameter), case.random_seed)
                 return None if pose is None else _moved(pose, np.asarray(crop.seed))
-            first = around(case, 0)
+            cloud = padded(case.points)
+            first = around(cloud, 0, case.random_seed)
             if first is None or not self.crops_again:
                 return first
-            middle = np.asarray(arrays.points, dtype=np.float64).mean(axis=0)
-            cloud = padded(case.points)
-            away = np.linalg.norm(np.asarray(cloud.points) - (first[:3, :3] @ middle + first[:3, 3])[None], axis=1)
-            again = around(case, int(np.where(np.asarray(cloud.mask), away, np.inf).argmin()))
+            away = np.linalg.norm(np.asarray(cloud.points) - placed(first, middle), axis=1)
+            again = around(cloud, int(np.where(np.asarray(cloud.mask), away, np.inf).argmin()), case.random_seed)
             return first if again is None else again
 
         return solve

@@ -52,16 +52,21 @@ def dominant_plane(
     normals, corner = normals[proper] / length[proper, None], corners[proper, 0]
     offsets = (normals * corner).sum(axis=1)
 
-    rough = _counts(sample.astype(np.float32), normals.astype(np.float32), offsets.astype(np.float32), margin)
-    most = np.flatnonzero(rough >= rough.max() - _ROUNDED)
-    best = int(most[_counts(sample, normals[most], offsets[most], margin).argmax()])
+    with ThreadPoolExecutor(2) as pool:  # NumPy lets others run as it counts
+        rough = _counts(sample.astype(np.float32), normals.astype(np.float32), offsets.astype(np.float32), margin, pool)
+        most = np.flatnonzero(rough >= rough.max() - _ROUNDED)
+        best = int(most[_counts(sample, normals[most], offsets[most], margin, pool).argmax()])
     found = fitted_plane(everything, normals[best], float(offsets[best]), margin)
     offset = found.offset + float(found.normal @ center)
     return Plane(found.normal, offset) if offset >= 0 else Plane(-found.normal, -offset)
 
 
 def _counts(
-    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "t 3"], offsets: Float[np.ndarray, " t"], margin: float
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "t 3"],
+    offsets: Float[np.ndarray, " t"],
+    margin: float,
+    pool: ThreadPoolExecutor,
 ) -> Int[np.ndarray, " t"]:
     """Return how many points are not farther from each plane than `margin`."""
 
@@ -72,8 +77,7 @@ def _counts(
         near = np.abs(away, out=away) <= margin
         return np.array([np.count_nonzero(row) for row in near])  # many times as fast as a sum
 
-    with ThreadPoolExecutor(2) as pool:  # NumPy lets others run as it counts
-        return np.concatenate(list(pool.map(counts_of, range(0, len(normals), _CHUNK))))
+    return np.concatenate(list(pool.map(counts_of, range(0, len(normals), _CHUNK))))
 
 
 def fitted_plane(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
-from kmn_jax.models._layers import Compute, NormalizedLinear, drawn_kernel, product
+from kmn_jax.models._layers import Compute, NormalizedLinear, drawn_kernel, precision_of, product
 
 HEADS = 4
 
@@ -45,13 +45,12 @@ class Attention(nnx.Module):
             product(rows, kernel[...], compute).reshape(len(rows), HEADS, -1)
             for rows, kernel in ((x, self.query), (others, self.key), (others, self.value))
         )
-        precision = jax.lax.Precision.HIGHEST if compute == "float32" else jax.lax.Precision.DEFAULT
-        fit = jnp.einsum("nhd,mhd->hnm", query, key, precision=precision).astype(jnp.float32)
+        fit = jnp.einsum("nhd,mhd->hnm", query, key, precision=precision_of(compute)).astype(jnp.float32)
         fit = fit / jnp.sqrt(jnp.float32(query.shape[2]))
         if self.pair is not None and pair_features is not None:
             fit = fit + jnp.moveaxis(product(pair_features, self.pair[...], compute), 2, 0).astype(jnp.float32)
         if others_mask is not None:
             fit = jnp.where(others_mask[None, None, :], fit, -jnp.inf)
         share = jax.nn.softmax(fit, axis=2).astype(value.dtype)
-        seen = jnp.einsum("hnm,mhd->nhd", share, value, precision=precision)
+        seen = jnp.einsum("hnm,mhd->nhd", share, value, precision=precision_of(compute))
         return (x + self.out(seen.reshape(len(x), -1), compute, mask)).astype(x.dtype)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from kmn_jax.geometry import farthest_point_indices, k_nearest, neighbor_graph
 from kmn_jax.models._attention import Attention
@@ -54,17 +54,14 @@ class CoarseLevel(nnx.Module):
 
         graph = neighbor_graph(few.xyz, min(self.num_neighbors, len(rows)), there)
         edges = there[:, None] & first(graph.shape[1])[None, :]
-        near = self.near(features[rows], graph, compute, None, edges, self._pairs(few, graph))
+        near = self.near(features[rows], graph, compute, None, edges, few.later_pair_features(graph, self.chiral))
         if isinstance(self.far, EdgeConv):
             far = self.far(near, graph, compute, None, edges)
         else:
             everyone = jnp.broadcast_to(jnp.arange(len(rows), dtype=jnp.int32), (len(rows), len(rows)))
-            far = self.far(near, near, compute, there, there, self._pairs(few, everyone))
+            far = self.far(near, near, compute, there, there, few.later_pair_features(everyone, self.chiral))
         told_by = k_nearest(inputs.xyz, few.xyz, min(_TOLD_BY, len(rows)), there)
         squared = ((inputs.xyz[:, None, :] - few.xyz[told_by]) ** 2).sum(axis=2)
         share = jnp.where(first(told_by.shape[1])[None, :], 1 / (squared + _TOUCHING), 0)
         share = (share / share.sum(axis=1, keepdims=True)).astype(far.dtype)
         return (share[:, :, None] * jnp.concatenate([near, far], axis=1)[told_by]).sum(axis=1)
-
-    def _pairs(self, few: EncoderInputs, graph: Int[Array, "m k"]) -> Float[Array, "m k p"] | None:
-        return few.pair_features(graph, True) if self.chiral else None

@@ -25,7 +25,7 @@ _CHOICES = {
     "pair_dropout": get_args(PairDropout),
     "attention": get_args(AttentionKind),
 }
-_SINCE = ("num_coarse_points", "attention")  # fields that networks of before do not have
+_ADDED_LATER = ("num_coarse_points", "attention")  # fields that networks of before do not have
 
 
 @dataclass(frozen=True, repr=False)
@@ -115,7 +115,7 @@ class KeyMatchNetConfig:
         return {
             field.name: getattr(self, field.name)
             for field in fields(self)
-            if field.name not in _SINCE or getattr(self, field.name) != field.default
+            if field.name not in _ADDED_LATER or getattr(self, field.name) != field.default
         }
 
     def __repr__(self) -> str:

@@ -62,26 +62,22 @@ class Encoder(nnx.Module):
         )
         if keypoint_indices is None:
             graph = graph if self.graph == "static" else neighbor_graph(x1, k, mask)
-            x2 = self.edge2(x1, graph, compute, None, edge_mask, self._later_pairs(inputs, graph))
+            x2 = self.edge2(x1, graph, compute, None, edge_mask, inputs.later_pair_features(graph, self.chiral))
             graph = graph if self.graph == "static" else neighbor_graph(x2, k, mask)
             x3 = self.edge3(x2, graph, compute, None, edge_mask)
         else:
             centers = x1[keypoint_indices]
             graph = graph[keypoint_indices] if self.graph == "static" else k_nearest(centers, x1, k, mask)
             edge_mask = None if edge_mask is None else edge_mask[keypoint_indices]
-            x2 = self.edge2(x1, graph, compute, centers, edge_mask, self._later_pairs(inputs, graph, keypoint_indices))
+            x2 = self.edge2(
+                x1, graph, compute, centers, edge_mask, inputs.later_pair_features(graph, self.chiral, keypoint_indices)
+            )
             x1, x3, mask = centers, self.edge3.complete_graph(x2, compute), None
         local = jnp.concatenate([x1, x2, x3], axis=1)
         if self.coarse is not None:
             local = jnp.concatenate([local, self.coarse(local, inputs, compute, mask)], axis=1)
         features = self._with_global(local, compute, mask)
         return features[places] if keypoint_indices is None else features
-
-    def _later_pairs(
-        self, inputs: EncoderInputs, graph: Int[Array, "n k"], centers: Int[Array, " n"] | None = None
-    ) -> Float[Array, "n k p"] | None:
-        """Return what the second block sees of its edges; in a static graph XLA computes them once for both."""
-        return inputs.pair_features(graph, True, centers) if self.chiral else None
 
     def _with_global(
         self, local: Float[Array, "n l"], compute: Compute, mask: Bool[Array, " n"] | None

@@ -57,6 +57,15 @@ class EncoderInputs(NamedTuple):
             features += [_volume(own, other, direction), _volume(own, direction, xyz[:, None, :])]
         return jnp.stack(features, axis=-1)
 
+    def later_pair_features(
+        self, graph: Int[Array, "n k"], chiral: bool, centers: Int[Array, " n"] | None = None
+    ) -> Float[Array, "n k p"] | None:
+        """Return what blocks after the first see of every edge: only `chiral` inputs have pair features there.
+
+        In a graph that the first block has, too, XLA computes them once for both.
+        """
+        return self.pair_features(graph, True, centers) if chiral else None
+
 
 def raw_inputs(cloud: Float[Array, "n 6"]) -> EncoderInputs:
     """Return the published inputs: coordinates and normals as they are."""

@@ -38,8 +38,12 @@ def product(x: Float[Array, "... i"], kernel: Float[Array, "i o"], compute: Comp
     """
     if compute == "bfloat16":
         return jnp.matmul(x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16))
-    precision = jax.lax.Precision.HIGHEST if compute == "float32" else jax.lax.Precision.DEFAULT
-    return jnp.matmul(x.astype(jnp.float32), kernel, precision=precision)
+    return jnp.matmul(x.astype(jnp.float32), kernel, precision=precision_of(compute))
+
+
+def precision_of(compute: Compute) -> jax.lax.Precision:
+    """Return how exactly products are computed whose operands are as they are to be."""
+    return jax.lax.Precision.HIGHEST if compute == "float32" else jax.lax.Precision.DEFAULT
 
 
 class Moments(NamedTuple):
