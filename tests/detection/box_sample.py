@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from kmn_jax.detection import CropPrediction, Detection, Detections, Scene, Timing, make_scene
@@ -18,10 +18,12 @@ WALL = 3.5  # its distance
 FRONT = 2.8  # that of the boxes' fronts
 POSES = (pose((-0.75, 0.0, 3.0)), pose((0.75, 0.0, 3.0)))  # T_camera_object, the boxes float before the wall
 
+_farthest = jax.jit(farthest_point_indices, static_argnums=1)
+
 
 def box_part(keypoints: int = 8, unit: str = "m") -> Part:
     many, directions = surface_points(box(*SIZES), 5000)
-    rows = np.asarray(farthest_point_indices(jnp.asarray(many, dtype=jnp.float32), 1200))
+    rows = np.asarray(_farthest(many.astype(np.float32), 1200))
     points, normals = many[rows], directions[rows]
     x, y, z = SIZES
     return Part(

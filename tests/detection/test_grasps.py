@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from tests.detection.box_sample import POSES, SIZES, WALL, box_part, box_view, d
 from tests.reference.meshes import pose, random_rotations
 
 PART, VIEW = box_part(), box_view()
+conflict = jax.jit(grasp_conflict)
 ACROSS = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # fingers close along the part's y
 BEHIND = np.diag([1.0, -1, -1, 1])  # from the back
 FOUND = Detections("box", "m", tuple(detection(PART, VIEW, T, 0.9) for T in POSES), Timing({"search": 0.5}, 0.0))
@@ -103,9 +105,8 @@ def test_conflicts_are_counted_as_a_plain_loop_counts_them() -> None:
     for point in points.astype(float):
         local = T[:3, :3].T @ (point - T[:3, 3])
         inside += any((np.abs(local - c) <= s / 2).all() for c, s in zip(centers, sizes, strict=True))
-    copy = Copy(pad_cloud(points, 1024), jnp.zeros((4, 3)), jnp.float32(0.1))
-    boxes = centers.astype(np.float32), sizes.astype(np.float32)
-    found = grasp_conflict(jnp.asarray(T, jnp.float32), *map(jnp.asarray, boxes), copy, VIEW.image)
+    copy = Copy(pad_cloud(points, 1024), jnp.zeros((256, 3)), jnp.float32(0.1))
+    found = conflict(T.astype(np.float32), centers.astype(np.float32), sizes.astype(np.float32), copy, VIEW.image)
     assert 0 < inside < 500
     assert found.inside == inside
 
@@ -113,14 +114,13 @@ def test_conflicts_are_counted_as_a_plain_loop_counts_them() -> None:
 @pytest.mark.parametrize(("x", "hidden"), [(0.75, 1.0), (-0.75, 0.0), (0.0, 0.0)])
 def test_behind_another_part_all_is_hidden_and_behind_its_own_nothing(x: float, hidden: float) -> None:
     own = (PART.points + POSES[0][:3, 3]).astype(np.float32)  # the left box
-    copy = Copy(pad_cloud(own[:0], 16), jnp.asarray(own[:256]), jnp.float32(0.1))
-    box = jnp.zeros((1, 3)), jnp.full((1, 3), 0.1)
-    deep = jnp.asarray(pose((x, 0, 3.15)), jnp.float32)
-    found = grasp_conflict(deep, *box, copy, VIEW.image)
+    copy = Copy(pad_cloud(own[:0], 1024), jnp.asarray(own[:256]), jnp.float32(0.1))
+    boxes = np.zeros((2, 3), np.float32), np.full((2, 3), 0.1, np.float32)  # in one place
+    found = conflict(pose((x, 0, 3.15)).astype(np.float32), *boxes, copy, VIEW.image)
     assert found.inside == 0
     assert found.hidden == pytest.approx(hidden)
-    deeper = deep.at[2, 3].set(3.45)  # than the own box reaches, too
-    assert grasp_conflict(deeper, *box, copy, VIEW.image).hidden == pytest.approx(float(x != 0))
+    deeper = pose((x, 0, 3.45)).astype(np.float32)  # than the own box reaches, too
+    assert conflict(deeper, *boxes, copy, VIEW.image).hidden == pytest.approx(float(x != 0))
 
 
 def test_grasps_are_one_for_each_part() -> None:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from experiments.solids import box, union
 from kmn_jax.detection import DepthAgreementConfig, DevicePart, Scene, make_scene, symmetry_transforms
 from kmn_jax.detection._look_alikes import MOST, look_alikes
-from kmn_jax.detection._polish import _polish_many, polish, polished
+from kmn_jax.detection._polish import _polish_many, polish, polish_one
 from kmn_jax.detection._refinement import refined_forms
 from kmn_jax.geometry import Camera, SmoothConfig, crop_around, measured_points
 from kmn_jax.io import Scan
@@ -26,8 +26,10 @@ from tests.reference.parts import box_part
 
 CAMERA = Camera(500.0, 500.0, 159.5, 119.5, 320, 240)
 TRUE = pose((0.05, -0.02, 3.0), random_rotations(1, 5)[0])
-POLISHED = jax.jit(polished)
 FORMS = jax.jit(refined_forms, static_argnames=("smooth", "agreement", "margin"))
+CROP = jax.jit(crop_around, static_argnums=(4, 5))
+SEEN = jax.jit(visible_by_splatting)
+NO_RIVALS = np.zeros(MOST, dtype=bool)
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +70,7 @@ def view_of(mesh: Mesh, T_camera_object: np.ndarray) -> Scene:
     return make_scene(Scan(points, None, depth, CAMERA, "m"), 1.0, inside=np.ones(len(points), dtype=bool))
 
 
+@pytest.mark.usefixtures("all_optimisations")  # it runs for long
 def test_look_alikes_lie_on_the_part_and_differ(part: Part) -> None:
     turns, is_real = turns_of(part)
     assert turns.shape == (MOST, 4, 4)
@@ -81,6 +84,7 @@ def test_look_alikes_lie_on_the_part_and_differ(part: Part) -> None:
             assert float(mssd(turn, other, part.points[:300])) > 0.08 * part.diameter
 
 
+@pytest.mark.usefixtures("all_optimisations")
 def test_look_alikes_of_a_part_are_found_once(part: Part) -> None:
     (turns, is_real), (again, _) = turns_of(part), turns_of(replace(part, name="of another scan"))
     assert again is turns
@@ -104,6 +108,7 @@ def test_a_box_with_a_notch_is_mistaken_for_its_half_turns(part: Part) -> None:
         assert min(apart) < 0.15 * part.diameter
 
 
+@pytest.mark.usefixtures("all_optimisations")
 def test_a_bracket_is_mistaken_for_itself_with_its_legs_exchanged() -> None:
     part = of_mesh(union(box((0, 0, 0), (1.0, 0.6, 0.1)), box((0, 0, 0), (0.1, 0.6, 0.8))))
     turns, is_real = turns_of(part)
@@ -115,6 +120,7 @@ def test_a_bracket_is_mistaken_for_itself_with_its_legs_exchanged() -> None:
     np.testing.assert_allclose(turned[row] @ [0, 0.3, 0, 1], [0, 0.3, 0, 1], atol=0.1)  # the corner stays
 
 
+@pytest.mark.usefixtures("all_optimisations")
 def test_a_symmetry_is_no_look_alike() -> None:
     symmetries = np.stack([np.eye(3), *(rotation_about(axis, np.pi) for axis in np.eye(3))])
     part = box_part(2000, rotations=symmetries)
@@ -123,8 +129,8 @@ def test_a_symmetry_is_no_look_alike() -> None:
     assert not (halves & is_real & (np.abs(turns[:, :3, 3]).max(axis=1) < 0.05 * part.diameter)).any()
 
 
-def device_of(part: Part, is_rival: np.ndarray) -> DevicePart:
-    turns, _ = turns_of(part)
+def device_of(part: Part, is_rival: np.ndarray = NO_RIVALS) -> DevicePart:
+    turns = turns_of(part)[0] if is_rival.any() else np.tile(np.eye(4, dtype=np.float32), (MOST, 1, 1))
     surfels = Surfels(jnp.asarray(part.points), jnp.asarray(part.normals), jnp.float32(part.area))
     arrays = PartArrays(surfels.points, surfels.normals, jnp.zeros((8, 4)), jnp.float32(part.diameter))
     return DevicePart(arrays, surfels, jnp.eye(4)[None], jnp.float32(0), jnp.asarray(turns), jnp.asarray(is_rival))
@@ -132,10 +138,10 @@ def device_of(part: Part, is_rival: np.ndarray) -> DevicePart:
 
 def forms_of(part: Part, scene: Scene, starts: np.ndarray, is_rival: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the refined forms of each start, and which of them there are."""
-    seed, on_device = jnp.int32(len(scene.points) // 2), device_of(part, is_rival)
-    crop = crop_around(jax.random.key(0), scene.cloud, seed, on_device.arrays.diameter, 2048, 1)
+    seed, on_device = np.int32(len(scene.points) // 2), device_of(part, is_rival)
+    crop = CROP(jax.random.key(0), scene.cloud, seed, on_device.arrays.diameter, 2048, 1)
     settings = {"smooth": SmoothConfig(), "agreement": DepthAgreementConfig(), "margin": 2.0}
-    results = [FORMS(jnp.asarray(start), crop, on_device, scene.image, **settings) for start in starts]
+    results = [FORMS(start, crop, on_device, scene.image, **settings) for start in starts]
     found, there = (np.stack(leaves) for leaves in zip(*results, strict=True))
     return found, there
 
@@ -161,7 +167,7 @@ def test_a_pipe_is_not_drawn_to_its_bore() -> None:
     assert inwards[:512].mean() > 0.3  # there is a bore that points may be drawn to
     starts = np.tile(lying.astype(np.float32), (3, 1, 1))
     starts[:, 2, 3] += [-0.02, 0.02, 0.04]
-    found, _ = forms_of(pipe, view_of(mesh, lying), starts, np.zeros(MOST, dtype=bool))
+    found, _ = forms_of(pipe, view_of(mesh, lying), starts, NO_RIVALS)
     assert np.abs(found[:, 0, 2, 3] - lying[2, 3]).max() < wall / 6
 
 
@@ -180,7 +186,7 @@ def moved(T: np.ndarray, seed: int, degrees: float, shift: float) -> np.ndarray:
 def test_polished_poses_are_those_of_the_image(
     part: Part, scene: Scene, noise: float, hidden: bool, bound: float
 ) -> None:
-    on_device, diameter = device_of(part, np.zeros(MOST, dtype=bool)), part.diameter
+    on_device, diameter = device_of(part), part.diameter
     rng = np.random.default_rng(0)
     depth = np.asarray(scene.image.depth)
     depth = np.where(depth > 0, depth + noise * diameter * rng.normal(size=depth.shape), 0).astype(np.float32)
@@ -190,7 +196,7 @@ def test_polished_poses_are_those_of_the_image(
         depth[rng.uniform(size=depth.shape) < 0.3] = 0
     image = scene.image._replace(depth=jnp.asarray(depth))
     for seed in range(3):
-        found = POLISHED(jnp.asarray(moved(TRUE, seed, 2.0, 0.015 * diameter)), on_device, image)
+        found = polish_one(moved(TRUE, seed, 2.0, 0.015 * diameter), on_device, image)
         assert float(mssd(found, TRUE.astype(np.float32), part.points[:300])) < bound * diameter
 
 
@@ -199,30 +205,34 @@ def test_a_part_that_shows_most_of_its_surface_is_polished_by_a_share_of_it() ->
     pyramid = corners, np.array([(0, 2, 1), (0, 3, 2), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)])[:, ::-1]
     of_pyramid, apex_first = of_mesh(pyramid), pose((0.05, -0.02, 3.0))
     image = view_of(pyramid, apex_first).image
-    on_device = device_of(of_pyramid, np.zeros(MOST, dtype=bool))
-    seen = visible_by_splatting(on_device.surfels, jnp.asarray(apex_first)[None], jnp.ones(1, dtype=bool), image.camera)
-    assert seen.mask.mean() > 0.6
+    on_device = device_of(of_pyramid)
+    seen = SEEN(on_device.surfels, apex_first[None].astype(np.float32), np.ones(1, dtype=bool), image.camera)
+    assert np.mean(seen.mask) > 0.6
     start = moved(apex_first, 0, 2.0, 0.015 * of_pyramid.diameter)
-    found = POLISHED(jnp.asarray(start), on_device, image)
+    found = polish_one(start, on_device, image)
     before, after = (float(mssd(at, apex_first.astype(np.float32), of_pyramid.points[:300])) for at in (start, found))
     assert after < 0.002 * of_pyramid.diameter < 0.1 * before
 
 
 def test_polishing_leaves_what_nothing_was_measured_of(part: Part, scene: Scene) -> None:
-    on_device, start = device_of(part, np.zeros(MOST, dtype=bool)), moved(TRUE, 0, 2.0, 0.01)
+    on_device, start = device_of(part), moved(TRUE, 0, 2.0, 0.01)
     behind, elsewhere = start.copy(), start.copy()
     behind[2, 3] *= -1
     elsewhere[0, 3] += 3 * part.diameter
-    for pose_, depth in ((start, 0 * scene.image.depth), (behind, scene.image.depth), (elsewhere, scene.image.depth)):
-        found = POLISHED(jnp.asarray(pose_), on_device, scene.image._replace(depth=depth))
+    for pose_, depth in (
+        (start, np.zeros_like(scene.image.depth)),
+        (behind, scene.image.depth),
+        (elsewhere, scene.image.depth),
+    ):
+        found = polish_one(pose_, on_device, scene.image._replace(depth=depth))
         np.testing.assert_array_equal(found, pose_)
 
 
 def test_many_are_polished_as_each_is(part: Part, scene: Scene) -> None:
-    on_device = device_of(part, np.zeros(MOST, dtype=bool))
+    on_device = device_of(part)
     starts = np.stack([moved(TRUE, seed, 2.0, 0.015 * part.diameter) for seed in range(3)])
     found, many = polish(starts, on_device, scene.image), _polish_many(starts, on_device, scene.image)
-    wanted = [POLISHED(jnp.asarray(start), on_device, scene.image) for start in starts]
+    wanted = [polish_one(start, on_device, scene.image) for start in starts]
     for result in (found, many):
         np.testing.assert_allclose(result, wanted, atol=1e-4 * part.diameter)
     assert polish(starts[:0], on_device, scene.image).shape == (0, 4, 4)
@@ -233,8 +243,6 @@ def test_polishing_does_not_slide_a_plate_along_itself() -> None:
     plate, flat = of_mesh(mesh), pose((0.05, -0.02, 3.0), np.diag([1.0, -1.0, -1.0]))
     start = flat.astype(np.float32)
     start[:3, 3] += [0.01, -0.01, 0.02]
-    found = np.asarray(
-        POLISHED(jnp.asarray(start), device_of(plate, np.zeros(MOST, dtype=bool)), view_of(mesh, flat).image)
-    )
+    found = np.asarray(polish_one(start, device_of(plate), view_of(mesh, flat).image))
     np.testing.assert_allclose(found[2, 3], flat[2, 3], atol=1e-3)
     assert (np.abs(found[:2, 3] - flat[:2, 3]) <= np.abs(start[:2, 3] - flat[:2, 3]) + 1e-3).all()

@@ -54,12 +54,17 @@ def on_device(part: Part) -> DevicePart:
 def chosen(
     poses: np.ndarray, score: np.ndarray, usable: np.ndarray | None = None, part: Part = BOX, **settings: float
 ) -> Selection:
-    usable = np.ones(len(score), dtype=bool) if usable is None else usable
-    arrays = jnp.asarray(poses), jnp.asarray(score, jnp.float32), jnp.asarray(usable)
-    return jax.device_get(choose(*arrays, on_device(part), **settings))
+    """Select among at most four poses: as so many of 256 points, all are chosen from by one program."""
+    count = len(score)
+    usable = np.ones(count, dtype=bool) if usable is None else usable
+    poses = np.concatenate([poses, np.tile(np.eye(4), (4 - count, 1, 1))]).astype(np.float32)
+    score, usable = np.pad(score, (0, 4 - count)).astype(np.float32), np.pad(usable, (0, 4 - count))
+    found = jax.device_get(choose(poses, score, usable, on_device(part), **settings))
+    return jax.tree.map(lambda leaf: leaf[:count], found)
 
 
 choose = jax.jit(select, static_argnames="contest")
+shared, inside = jax.jit(overlap), jax.jit(share_inside)
 
 
 def test_distances_are_those_of_the_farthest_point() -> None:
@@ -91,10 +96,13 @@ def test_continuous_symmetries_are_taken_in_steps() -> None:
 def test_what_two_parts_share_is_counted_but_not_where_they_touch() -> None:
     half_turn = moved(0, 0, 0, rotation_about(Z, np.pi))
     others = [np.eye(4), moved(5, 0, 0), moved(0, 1.0, 0), moved(0, 0.4, 0), half_turn]
-    spacing = jnp.float32((BOX.area / len(BOX.points)) ** 0.5)
-    surface = jnp.asarray(BOX.points), jnp.asarray(BOX.normals)
-    share = jax.jit(lambda other: overlap(jnp.eye(4), other, *surface, spacing, jnp.float32(0.05)))
-    found = np.array([share(jnp.asarray(other, jnp.float32)) for other in others])
+    given = (
+        BOX.points,
+        BOX.normals.astype(np.float32),
+        np.float32((BOX.area / len(BOX.points)) ** 0.5),
+        np.float32(0.05),
+    )
+    found = np.array([shared(NO_TURN[0], other.astype(np.float32), *given) for other in others])
     assert found[0] == 1
     assert found[1] == 0
     assert found[2] < 0.1  # they touch
@@ -103,23 +111,20 @@ def test_what_two_parts_share_is_counted_but_not_where_they_touch() -> None:
 
 
 def test_the_best_of_what_excludes_each_other_is_taken() -> None:
-    score = np.array([0.5, 0.9, 0.8, 0.99, 0.4])
+    score = np.float32([0.5, 0.9, 0.8, 0.99, 0.4])
     usable = np.array([True, True, True, False, True])
     excluded = np.zeros((5, 5), dtype=bool)
     for one, other in ((0, 1), (2, 4), (3, 1)):
         excluded[one, other] = excluded[other, one] = True
     rows = jnp.asarray(excluded)
-
-    def taken(score: np.ndarray) -> np.ndarray:
-        return np.asarray(_greedy(jnp.asarray(score), jnp.asarray(usable), lambda row: rows[row])[0])
-
+    taken = jax.jit(lambda score: _greedy(score, jnp.asarray(usable), lambda row: rows[row])[0])
     np.testing.assert_array_equal(taken(score), [False, True, True, False, False])
     np.testing.assert_array_equal(taken(score * 0), [True, False, True, False, False])
 
 
 def test_parts_too_far_apart_to_touch_are_two_also_if_all_that_is_known_of_one_is_its_inside() -> None:
     """From anywhere outside, a point is behind the nearest bit of a hollow ball, whose surface faces inwards."""
-    angle, height = np.arange(128) * 2.4, np.linspace(-0.99, 0.99, 128)
+    angle, height = np.arange(256) * 2.4, np.linspace(-0.99, 0.99, 256)
     ring = np.sqrt(1 - height**2)
     ball = np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1).astype(np.float32)
     hollow = replace(BOX, points=ball, normals=-ball, minimum=-np.ones(3), maximum=np.ones(3), diameter=2.0, area=12.6)
@@ -133,10 +138,9 @@ def test_nothing_is_in_a_part_beyond_a_thin_leg_of_which_only_two_points_are_kno
     """The nearest bits of what lies below the leg all face upwards: behind them it is not inside."""
     leg = np.array([[0.05, 0, -1.2], [-0.05, 0, -1.2]], dtype=np.float32)
     sides = np.array([[0.8, 0, 0.6], [-0.8, 0, 0.6]], dtype=np.float32)
-    points, normals = np.concatenate([leg, BOX.points]), np.concatenate([sides, BOX.normals])
-    surface, spacing = (jnp.asarray(points), jnp.asarray(normals)), jnp.float32((BOX.area / len(points)) ** 0.5)
-    below = jnp.asarray(moved(0, 0, -2.4), jnp.float32)
-    assert overlap(jnp.eye(4), below, *surface, spacing, jnp.float32(0.1)) == 0
+    points, normals = np.concatenate([leg, BOX.points[2:]]), np.concatenate([sides, BOX.normals[2:]])
+    spacing, below = np.float32((BOX.area / len(points)) ** 0.5), moved(0, 0, -2.4).astype(np.float32)
+    assert shared(NO_TURN[0], below, points, normals, spacing, np.float32(0.1)) == 0
     legged = replace(BOX, points=points, normals=normals, minimum=points.min(axis=0))
     for away, both in ((0.4, False), (2.4, True)):
         found = chosen(np.stack([np.eye(4), moved(0, 0, -away)]), np.array([0.9, 0.8]), part=legged)
@@ -144,28 +148,27 @@ def test_nothing_is_in_a_part_beyond_a_thin_leg_of_which_only_two_points_are_kno
 
 
 def test_nothing_is_in_a_surface_of_one_side_but_within_its_box() -> None:
-    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 12), np.linspace(-0.5, 0.5, 12))
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 16), np.linspace(-0.5, 0.5, 16))
     cap = np.stack([x, y, 0.5 - x**2 - y**2], axis=-1).reshape(-1, 3).astype(np.float32)
     upwards = np.stack([2 * x, 2 * y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-    known = jnp.asarray(cap), jnp.asarray(upwards / np.linalg.norm(upwards, axis=1, keepdims=True), jnp.float32)
-    block = 0.05 * jnp.asarray(BOX.points[:144]), jnp.asarray(BOX.normals[:144])
+    known = cap, (upwards / np.linalg.norm(upwards, axis=1, keepdims=True)).astype(np.float32)
+    block = np.float32(0.05) * BOX.points, BOX.normals
     for height, share in ((0.2, 1.0), (-0.5, 0.0)):
-        place = jnp.asarray(moved(0, 0, height), jnp.float32)
-        assert share_inside(place, block, known, jnp.float32(0.1), jnp.float32(0.05)) == share
+        place = moved(0, 0, height).astype(np.float32)
+        assert inside(place, block, known, np.float32(0.1), np.float32(0.05)) == share
 
 
 def test_nothing_is_in_a_part_beyond_its_hull_though_within_its_box() -> None:
     """Beyond a thin leg again, whose known bits face upwards; another leg reaches farther down on the other side."""
     legs = np.array([[1.05, 0, -1.2], [0.95, 0, -1.2], [-1.5, 0, -2.4]], dtype=np.float32)
     sides = np.array([[0.8, 0, 0.6], [-0.8, 0, 0.6], [0.7071, 0, -0.7071]], dtype=np.float32)
-    known = jnp.asarray(np.concatenate([legs, BOX.points])), jnp.asarray(np.concatenate([sides, BOX.normals]))
-    block = 0.05 * (known[0] - known[0].mean(axis=0, keepdims=True)), known[1]
-    low, high = (np.asarray(bound(known[0], axis=0)) for bound in (jnp.min, jnp.max))
+    known = np.concatenate([legs, BOX.points[3:]]), np.concatenate([sides, BOX.normals[3:]])
+    block = np.float32(0.05) * (known[0] - known[0].mean(axis=0)), known[1]
+    low, high = known[0].min(axis=0), known[0].max(axis=0)
     for at, share in (((0.9, 0, -2.0), 0.0), ((0, 0, 0), 1.0)):
-        place = jnp.asarray(moved(*at), jnp.float32)
-        points = np.asarray(block[0]) + np.array(at)
+        place, points = moved(*at).astype(np.float32), block[0] + np.array(at)
         assert ((points > low) & (points < high)).all()
-        assert share_inside(place, block, known, jnp.float32(0.1), jnp.float32(0.05)) == share
+        assert inside(place, block, known, np.float32(0.1), np.float32(0.05)) == share
 
 
 def test_slender_parts_side_by_side_are_two() -> None:

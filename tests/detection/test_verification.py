@@ -21,7 +21,6 @@ from kmn_jax.detection import (
     Scene,
     SearchConfig,
     candidates_of,
-    gather_evidence,
     picture_agreement,
     refined_candidates,
     verified,
@@ -32,7 +31,7 @@ from kmn_jax.detection import _verification as module
 from kmn_jax.detection._picture_cells import measured, predicted
 from kmn_jax.detection._search import no_poses
 from kmn_jax.geometry import intrinsics
-from kmn_jax.models import VERIFIER_CHANNELS, create_verifier, verify
+from kmn_jax.models import VERIFIER_CHANNELS, create_verifier, load_verifier, verify
 from kmn_jax.objects import PartArrays
 from kmn_jax.simulate import Surfels
 from tests.detection.box_sample import CAMERA, POSES, box_part, box_view
@@ -42,11 +41,12 @@ PART, VIEW = box_part(), box_view()
 SURFELS = Surfels(jnp.asarray(PART.points), jnp.asarray(PART.normals), jnp.float32(PART.area))
 MASK, THERE, GAP, OWN, OTHER, COSINE, HAS_NORMAL, AWAY, NOISE, TOWARD, IN_IMAGE = range(VERIFIER_CHANNELS)
 see = jax.jit(verifier_cells)
+find_agreement = jax.jit(picture_agreement)
 
 
 def cells_of(T: np.ndarray, depth: np.ndarray | None = None, diameter: float = PART.diameter) -> np.ndarray:
     image = DepthImage(jnp.asarray(VIEW.depth if depth is None else depth), intrinsics(CAMERA))
-    cells = np.asarray(see(jnp.asarray(T, dtype=jnp.float32), SURFELS, image, jnp.float32(diameter)))
+    cells = np.asarray(see(T.astype(np.float32), SURFELS, image, np.float32(diameter)))
     assert np.isfinite(cells).all()
     assert np.abs(np.delete(cells, TOWARD, axis=-1)).max() <= 1
     return cells
@@ -68,9 +68,7 @@ def test_at_the_right_pose_the_cells_agree() -> None:
     assert (cells[..., (GAP, OWN, AWAY)][~mask] == 0).all()
     beyond = (cells[..., THERE] > 0) & ~mask
     assert (np.isin(cells[..., OTHER][beyond], 0.5) | (np.abs(cells[..., OTHER][beyond]) < 0.1)).mean() > 0.95
-    agreement = picture_agreement(
-        jnp.asarray(POSES[0], dtype=jnp.float32), SURFELS, _image(), jnp.float32(PART.diameter)
-    )
+    agreement = find_agreement(POSES[0].astype(np.float32), SURFELS, _image(), np.float32(PART.diameter))
     near = (cells[..., AWAY] < 0.02 / 0.06) & (cells[..., THERE] > 0)
     assert (near & mask).sum() / mask.sum() == pytest.approx(float(agreement.near))
 
@@ -109,9 +107,9 @@ def test_farther_and_nearer_are_told_apart() -> None:
 def test_they_do_not_depend_on_the_unit_of_length() -> None:
     T = POSES[0].copy()
     T[:3, 3] *= 1000
-    surfels = Surfels(1000 * SURFELS.points, SURFELS.normals, 1e6 * SURFELS.area)
-    image = DepthImage(1000 * jnp.asarray(VIEW.depth), intrinsics(CAMERA))
-    large = see(jnp.asarray(T, dtype=jnp.float32), surfels, image, jnp.float32(1000 * PART.diameter))
+    surfels = Surfels(1000 * PART.points, PART.normals, np.float32(1e6 * PART.area))
+    image = DepthImage(1000 * VIEW.depth, intrinsics(CAMERA))
+    large = see(T.astype(np.float32), surfels, image, np.float32(1000 * PART.diameter))
     different = np.abs(np.asarray(large) - cells_of(POSES[0])) > 1e-2
     assert different.mean() < 0.002  # where cells are as near to one pixel as to another
 
@@ -123,12 +121,14 @@ def test_of_a_pose_that_cannot_be_seen_nothing_is_said(T: np.ndarray) -> None:
 
 
 def test_poses_are_verified_as_their_cells_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    verifier = create_verifier(jax.random.key(0))
+    drawn = jax.jit(lambda key: create_verifier(key).parameters)(jax.random.key(0))
+    verifier = load_verifier()._replace(parameters=drawn)
     monkeypatch.setattr(module, "_shipped", lambda: verifier)
     poses = np.stack([POSES[0], POSES[1], pose((0.3, 0.1, 3.2))]).astype(np.float32)
     part = _on_device()
     found = verified(poses, part, VIEW)
-    wanted = [float(verify(*verifier, jnp.asarray(cells_of(T)))) for T in poses]
+    said = jax.jit(lambda cells: verify(*verifier, cells))
+    wanted = [float(said(cells_of(T))) for T in poses]
     np.testing.assert_allclose(found, wanted, atol=1e-4)
     assert np.ptp(found) > 0.01
     many = module._verify_many(poses, *verifier, part.surfels, VIEW.image, part.arrays.diameter)
@@ -139,6 +139,7 @@ def test_poses_are_verified_as_their_cells_are(monkeypatch: pytest.MonkeyPatch) 
 def test_refined_poses_alone_are_shown_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three candidates of two crops are refined, in two forms each, of which one is missing."""
     shown: list[np.ndarray] = []
+    found_by_rows: list[Any] = []
 
     def refined(poses: np.ndarray, *given: object) -> tuple[np.ndarray, np.ndarray]:
         forms = np.stack([poses, poses], axis=1)
@@ -150,7 +151,8 @@ def test_refined_poses_alone_are_shown_to_it(monkeypatch: pytest.MonkeyPatch) ->
         return poses[:, 0, 3]
 
     def rows(one: object, many: Callable[..., Any], *items: Any) -> Any:
-        return many(*items)
+        found_by_rows.append(many(*items))
+        return found_by_rows[-1]
 
     monkeypatch.setattr(detecting, "call_rows", rows)
     monkeypatch.setattr(detecting, "refine_many", refined)
@@ -171,12 +173,12 @@ def test_refined_poses_alone_are_shown_to_it(monkeypatch: pytest.MonkeyPatch) ->
     column = fine.evidence[:, EVIDENCE.index(VERIFIED)]
     np.testing.assert_array_equal(column, np.where(fine.usable, fine.T_camera_object[:, 0, 3], 0))
     assert [len(part) for part in shown] == [5]
-    of_found = gather_evidence(none, _on_device().arrays, _on_device().surfels, VIEW.image, config.agreement)
-    assert (np.asarray(of_found)[:, EVIDENCE.index(VERIFIED)] == 0).all()
+    before = np.asarray(found_by_rows[-1])  # the evidence of all poses, which the verifier has not been shown yet
+    assert (before[..., EVIDENCE.index(VERIFIED)] == 0).all()
 
 
 def _image() -> DepthImage:
-    return DepthImage(jnp.asarray(VIEW.depth), intrinsics(CAMERA))
+    return DepthImage(VIEW.depth, intrinsics(CAMERA))
 
 
 def _on_device() -> DevicePart:
@@ -192,10 +194,11 @@ def test_normals_at_the_edge_of_the_picture_are_those_of_the_surface() -> None:
     squared = (rays**2).sum(axis=-1)
     inside = away**2 - squared * (away**2 - radius**2)
     depth = np.where(inside > 0, (away - np.sqrt(np.maximum(inside, 0))) / squared, 0).astype(np.float32)
-    image = DepthImage(jnp.asarray(depth), intrinsics(CAMERA))
-    seen = predicted(jnp.asarray(pose((0.0, 0.0, away - radius)), dtype=jnp.float32), SURFELS, image)
-    found = measured(seen, image, jnp.float32(PART.diameter))
+    image = DepthImage(depth, intrinsics(CAMERA))
+    T, diameter = pose((0.0, 0.0, away - radius)).astype(np.float32), np.float32(PART.diameter)
+    measure = jax.jit(lambda T, image, diameter: measured(predicted(T, SURFELS, image), image, diameter))
+    found = measure(T, image, diameter)
     outward = np.asarray(found.points) - (0, 0, away)
     cosines = (outward / radius * np.asarray(found.normals)).sum(axis=-1)
-    assert found.has_normal.all()
+    assert np.asarray(found.has_normal).all()
     assert cosines.min() > 0.99  # 0.966 where they do

@@ -7,20 +7,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import box_surface
 from kmn_jax.geometry import group_points, nearest, nearest_within
+from tests.reference.clouds import box_cloud
+
+BOX = (0.8, 0.5, 0.33)  # of diameter 1
 
 
-def cloud(name: str, key: jax.Array, count: int) -> jax.Array:
+def cloud(name: str, seed: int, count: int) -> np.ndarray:
+    inside = np.random.default_rng(seed).random((count, 3), np.float32)
     match name:
         case "surface":
-            return box_surface(key, count, 1.0)[0]
+            return box_cloud(seed, count, BOX)[:, :3]
         case "volume":
-            return jax.random.uniform(key, (count, 3))
+            return inside
         case "lattice":  # of equally far points, and points in one place
-            return jnp.round(4 * jax.random.uniform(key, (count, 3))) / 4
+            return np.round(4 * inside) / 4
         case _:  # all in one place
-            return jnp.full((count, 3), 0.25)
+            return np.full((count, 3), 0.25, np.float32)
 
 
 @jax.jit
@@ -38,15 +41,13 @@ def both(queries: jax.Array, points: jax.Array, mask: jax.Array, asked: jax.Arra
 @pytest.mark.parametrize("counts", [(700, 900), (1, 33)])
 @pytest.mark.parametrize("name", ["surface", "volume", "lattice", "one place"])
 def test_neighbours_are_those_of_all_distances(name: str, counts: tuple[int, int]) -> None:
-    keys = jax.random.split(jax.random.key(0), 4)
-    queries, points = cloud("volume", keys[0], counts[0]), cloud(name, keys[1], counts[1])
-    mask, asked = (jax.random.uniform(key, (count,)) < 0.7 for key, count in zip(keys[2:], counts[::-1], strict=True))
-    points = jnp.where(mask[:, None], points, jnp.nan)
-    queries = jnp.where(asked[:, None], queries, jnp.nan)
+    queries, points = cloud("volume", 0, counts[0]), cloud(name, 1, counts[1])
+    asked, mask = (np.random.default_rng(2).random(count) < 0.7 for count in counts)
+    points = np.where(mask[:, None], points, np.float32(np.nan))
+    queries = np.where(asked[:, None], queries, np.float32(np.nan))
     for reach in (0.05, 0.3, 10.0):
-        real, asked_for, rows, dense, distance, far = map(
-            np.asarray, both(queries, points, mask, asked, jnp.float32(reach))
-        )
+        given = queries, points, mask, asked, np.float32(reach)
+        real, asked_for, rows, dense, distance, far = jax.device_get(both(*given))
         assert sorted(asked_for[real]) == list(np.flatnonzero(asked))
         inside = far[real] <= reach
         np.testing.assert_array_equal(np.isfinite(distance[real]), inside)
@@ -55,8 +56,8 @@ def test_neighbours_are_those_of_all_distances(name: str, counts: tuple[int, int
 
 
 def test_groups_hold_neighbours() -> None:
-    points = box_surface(jax.random.key(1), 2048, 1.0)[0]
-    groups = jax.jit(group_points)(points)
-    assert sorted(np.asarray(groups.rows).reshape(-1)) == list(range(2048))
+    points = box_cloud(1, 2048, BOX)[:, :3]
+    groups = jax.device_get(jax.jit(group_points)(points))
+    assert sorted(groups.rows.reshape(-1)) == list(range(2048))
     np.testing.assert_array_equal(groups.points, points[groups.rows])
-    assert np.median(np.ptp(np.asarray(groups.points), axis=1).max(axis=1)) < 0.25
+    assert np.median(np.ptp(groups.points, axis=1).max(axis=1)) < 0.25

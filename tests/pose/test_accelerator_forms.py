@@ -7,14 +7,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import box_surface, synthetic_matches
-from kmn_jax.geometry import random_pose, rotate_vectors, transform_points
+from benchmarks.synthetic import synthetic_matches
 from kmn_jax.pose import IcpConfig, Matches, PoseResult, RansacConfig, icp, ransac_modes
 from kmn_jax.pose._icp import _icp
 from kmn_jax.pose._ransac import _ransac
+from tests.reference.clouds import box_cloud
 from tests.reference.devices import accelerator_forms
+from tests.reference.poses import some_poses
 
 _DIAMETER = 50.0
+
+
+@jax.jit
+def _draw(seed: int) -> Matches:
+    return synthetic_matches(jax.random.key(seed), num_matches=300, inlier_share=0.3)[0]
 
 
 def assert_same(found: PoseResult, expected: PoseResult, unit: float) -> None:
@@ -30,31 +36,29 @@ def assert_same(found: PoseResult, expected: PoseResult, unit: float) -> None:
 def test_all_hypotheses_refitted_at_once_end_where_one_mode_after_the_other_does(use_normals: bool) -> None:
     config = RansacConfig(num_hypotheses=200, num_candidates=2000, num_refinements=2, use_normals=use_normals)
 
-    def draw(seed: int) -> Matches:
-        return synthetic_matches(jax.random.key(seed), num_matches=300, inlier_share=0.3)[0]
-
     # Right matches, none that is usable, and all of one keypoint, which determine no pose.
-    given = [draw(0), draw(1), draw(2), draw(2)._replace(mask=jnp.zeros(300, dtype=bool))]
-    given.append(draw(3)._replace(object_points=jnp.ones((300, 3))))
-    matches: Matches = jax.tree.map(lambda *leaves: jnp.stack(leaves), *given)
+    given = [_draw(0), _draw(1), _draw(2), _draw(2)._replace(mask=np.zeros(300, dtype=bool))]
+    given.append(_draw(3)._replace(object_points=np.ones((300, 3), np.float32)))
+    matches: Matches = jax.tree.map(lambda *leaves: np.stack(leaves), *given)
     keys = jax.random.split(jax.random.key(0), len(given))
     expected = jax.vmap(lambda key, one: ransac_modes(key, one, 3, config))(keys, matches)
     with accelerator_forms() as asked:
         found = jax.jit(jax.vmap(lambda key, one: _ransac.__wrapped__(key, one, config, 3)))(keys, matches)
     assert any("_at_once" in repr(form) for form in asked)
-    assert np.asarray(expected.converged[:, 0]).tolist() == [True, True, True, False, False]
+    assert np.asarray(expected.converged)[:, 0].tolist() == [True, True, True, False, False]
     assert_same(found, expected, _DIAMETER)
 
 
 def test_rounds_that_change_nothing_are_harmless() -> None:
-    keys = jax.random.split(jax.random.key(5), 4)
-    (model, _), (points, normals) = box_surface(keys[0], 400, _DIAMETER), box_surface(keys[1], 200, _DIAMETER)
-    truth = random_pose(keys[2], _DIAMETER)
-    scene, scene_normals = transform_points(truth, points), rotate_vectors(truth, normals)
+    model, surface = jnp.asarray(box_cloud(0, 400)[:, :3]), box_cloud(1, 200)
+    truth = some_poses(1, 5)[0]
+    scene = jnp.asarray(surface[:, :3] @ truth[:3, :3].T + truth[:3, 3], jnp.float32)
+    scene_normals = jnp.asarray(surface[:, 3:] @ truth[:3, :3].T, jnp.float32)
     # Near ones end before the last round, one is far from all points.
-    starts = jnp.stack([truth.at[:3, 3].add(shift) for shift in (0.01 * _DIAMETER, 1e-3, 3 * _DIAMETER)])
+    starts = np.tile(truth.astype(np.float32), (3, 1, 1))
+    starts[:, :3, 3] += np.float32([[0.01 * _DIAMETER], [1e-3], [3 * _DIAMETER]])
     config = IcpConfig(iterations=20)
-    masks = jnp.ones(400, dtype=bool), jnp.arange(200) % 7 > 0
+    masks = jnp.ones(400, dtype=bool), jnp.asarray(np.arange(200) % 7 > 0)
     expected = jax.vmap(lambda start: icp(model, scene, start, _DIAMETER, scene_normals, *masks, config))(starts)
 
     def refine(start: jax.Array) -> PoseResult:

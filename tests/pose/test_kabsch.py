@@ -6,16 +6,18 @@ import pytest
 from kmn_jax.errors import InputError
 from kmn_jax.pose import kabsch
 
-# Corner cases of the shape of a point set; all but the collinear one determine a rotation.
+# Corner cases of the shape of a point set; all but the collinear one determine a rotation. As far as it can be, of six
+# points: each number of them is compiled for.
 SHAPES = {
-    "regular": np.random.default_rng(0).normal(size=(7, 3)),
+    "regular": np.random.default_rng(0).normal(size=(6, 3)),
     "planar": np.random.default_rng(1).normal(size=(6, 3)) * [1, 1, 0],
     "triplet": np.array([[0.0, 0, 0], [1, 0, 0], [0.3, 0.8, 0]]),
     "octahedron": np.concatenate([np.eye(3), -np.eye(3)]),  # all singular values equal
-    "square": np.array([[1.0, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]]),  # two equal, one zero
+    "square": np.array([[1.0, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0], [0, 0, 0], [0, 0, 0]]),  # two equal, one zero
     "prism": np.concatenate([np.eye(3), -np.eye(3)]) * [1, 1, 3],  # two equal
 }
-COLLINEAR = np.linspace(-1, 2, 5)[:, None] * np.array([[1.0, 2, -0.5]]) + 0.3
+COLLINEAR = np.linspace(-1, 2, 6)[:, None] * np.array([[1.0, 2, -0.5]]) + 0.3
+reverse_mode = jax.jit(jax.jacrev(kabsch, argnums=(0, 1)))
 
 
 def random_rotation(generator):
@@ -73,7 +75,7 @@ def test_weights(seed):
 def test_never_mirrors(seed):
     source, target = make_pair(seed, noise=0.01)
     mirrored = target * np.array([1, 1, -1], np.float32)
-    pose = kabsch(source, mirrored)
+    pose = np.asarray(kabsch(source, mirrored))
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1, abs=1e-5)
     np.testing.assert_allclose(pose, reference(source, mirrored), atol=2e-5)
 
@@ -88,12 +90,12 @@ def test_collinear_points_give_a_proper_rotation_that_fits(seed):
 
 
 def test_duplicated_points():
-    same = np.full((5, 3), 2.5, np.float32)
+    same = np.full((6, 3), 2.5, np.float32)
     pose = np.asarray(kabsch(same, same + 1))
     np.testing.assert_allclose(pose, [[1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1], [0, 0, 0, 1]], atol=1e-6)
     source, target = make_pair(0)
-    twice = kabsch(np.concatenate([source, source[:4]]), np.concatenate([target, target[:4]]))
-    weights = np.r_[np.full(4, 2), np.ones(8)].astype(np.float32)
+    twice = kabsch(np.concatenate([source[:8], source[:4]]), np.concatenate([target[:8], target[:4]]))
+    weights = np.repeat(np.float32([2, 1, 0]), 4)
     np.testing.assert_allclose(twice, kabsch(source, target, weights), atol=1e-6)
 
 
@@ -116,15 +118,15 @@ def test_far_from_the_origin():
 
 @pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
 def test_half_precision_is_computed_in_float32(dtype):
-    source, target = (jnp.asarray(points, dtype) for points in make_pair(0))
+    source, target = (points.astype(dtype) for points in make_pair(0))
     pose = kabsch(source, target)
     assert pose.dtype == jnp.float32
-    np.testing.assert_allclose(pose, kabsch(source.astype(jnp.float32), target.astype(jnp.float32)), atol=1e-6)
+    np.testing.assert_allclose(pose, kabsch(source.astype(np.float32), target.astype(np.float32)), atol=1e-6)
 
 
 def test_vmap_and_jit_agree_with_single_calls():
     pairs = [make_pair(seed) for seed in range(4)]
-    source, target = (jnp.stack(side) for side in zip(*pairs, strict=True))
+    source, target = (np.stack(side) for side in zip(*pairs, strict=True))
     singles = np.stack([kabsch(a, b) for a, b in pairs])
     np.testing.assert_allclose(jax.vmap(kabsch)(source, target), singles, atol=1e-6)
     np.testing.assert_allclose(jax.jit(jax.vmap(kabsch))(source, target), singles, atol=1e-6)
@@ -169,16 +171,14 @@ def test_gradients_match_finite_differences(shape, noise):
 def test_forward_and_reverse_mode_agree(shape):
     source, target = make_pair(6, SHAPES[shape])
     forward = jax.jit(jax.jacfwd(kabsch, argnums=(0, 1)))(source, target)
-    reverse = jax.jit(jax.jacrev(kabsch, argnums=(0, 1)))(source, target)
-    for a, b in zip(forward, reverse, strict=True):
+    for a, b in zip(forward, reverse_mode(source, target), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-5)
 
 
-@pytest.mark.parametrize("points", [COLLINEAR, np.zeros((4, 3)), np.repeat(COLLINEAR[:2], 3, axis=0)])
+@pytest.mark.parametrize("points", [COLLINEAR, np.zeros((6, 3)), np.repeat(COLLINEAR[:2], 3, axis=0)])
 def test_gradients_are_finite_where_the_rotation_is_open(points):
     source, target = make_pair(7, points, noise=0)
-    for argument in (0, 1):
-        gradient = np.asarray(jax.jit(jax.jacrev(kabsch, argnums=argument))(source, target))
+    for gradient in jax.device_get(reverse_mode(source, target)):
         assert np.isfinite(gradient).all()
         assert np.abs(gradient).max() < 1e3
 
@@ -191,10 +191,10 @@ def test_gradient_descent_through_kabsch_reaches_a_target_rotation():
         return ((kabsch(source, target)[:3, :3] - wanted) ** 2).sum()
 
     step = jax.jit(lambda target: target - 2.0 * jax.grad(loss)(target))
-    start = loss(target)
+    start = jax.jit(loss)(target)
     for _ in range(200):
         target = step(target)
-    assert loss(target) < 1e-3 * start
+    assert float(jax.jit(loss)(target)) < 1e-3 * float(start)
 
 
 BAD = {
@@ -222,7 +222,7 @@ def test_bad_input_is_named(case):
 
 def test_traced_points_that_are_not_finite_count_as_weight_zero():
     source, target = make_pair(0)
-    expected = kabsch(source[1:], target[1:])
+    expected = kabsch(source, target, np.float32(np.arange(12) > 0))
     target[0] = np.nan
     np.testing.assert_allclose(jax.jit(kabsch)(source, target), expected, atol=1e-6)
     nothing = jax.jit(kabsch)(source, np.full_like(target, np.nan))

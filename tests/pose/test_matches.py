@@ -1,5 +1,4 @@
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -10,10 +9,10 @@ N, K = 40, 6
 
 
 def make_case(seed=0, n=N, k=K):
-    keys = jax.random.split(jax.random.key(seed), 6)
-    segmentation, keypoint = jax.random.normal(keys[0], (n, 2)), 2 * jax.random.normal(keys[1], (n, k))
-    clouds = [jax.random.normal(key, (rows, 3)) for key, rows in zip(keys[2:], (n, n, k, k), strict=True)]
-    return segmentation, keypoint, *clouds, 2.0
+    generator = np.random.default_rng(seed)
+    segmentation, keypoint = generator.normal(size=(n, 2)), 2 * generator.normal(size=(n, k))
+    clouds = [generator.normal(size=(rows, 3)) for rows in (n, n, k, k)]
+    return *(array.astype(np.float32) for array in (segmentation, keypoint, *clouds)), 2.0
 
 
 def softmax(logits, axis=1):
@@ -36,7 +35,7 @@ def reference(case, threshold, axis=1):
 def test_against_numpy(seed, threshold, softmax, axis):
     case = make_case(seed)
     config = MatchConfig(vote_threshold=threshold, softmax=softmax, capacity=300)
-    matches = find_matches(*case, config=config)
+    matches = jax.device_get(find_matches(*case, config=config))
     expected = reference(case, threshold, axis)
     assert matches.mask.sum() == len(expected)
     assert not matches.overflow
@@ -61,7 +60,7 @@ def test_overflow_keeps_the_best():
 
 def test_large_logits_do_not_overflow():
     case = make_case()
-    matches = find_matches(case[0] * 1e4, case[1] * 1e4, *case[2:])
+    matches = find_matches(case[0] * np.float32(1e4), case[1] * np.float32(1e4), *case[2:])
     assert matches.mask.any()
     for field in matches:
         assert np.isfinite(field).all()
@@ -69,7 +68,7 @@ def test_large_logits_do_not_overflow():
 
 def test_nothing_segmented_gives_no_pose():
     case = make_case()
-    matches = find_matches(jnp.tile(jnp.array([[3.0, -3.0]]), (N, 1)), *case[1:])
+    matches = find_matches(np.tile(np.float32([3, -3]), (N, 1)), *case[1:])
     assert not matches.mask.any()
     result = ransac(jax.random.key(0), matches)
     assert result.status == PoseStatus.TOO_FEW_MATCHES
@@ -112,18 +111,17 @@ def test_points_that_are_not_real_change_nothing(softmax):
 
 def test_masked_points_never_vote():
     case = make_case()
-    mask = np.arange(N) < 25
-    rubbish = [jnp.where(mask[:, None], array, jnp.nan) for array in case[:4]]
+    mask = np.arange(N) < 30
+    rubbish = [np.where(mask[:, None], array, np.float32(np.nan)) for array in case[:4]]
     matches = find_matches(*rubbish, *case[4:], mask=mask)
-    expected = find_matches(*(array[:25] for array in case[:4]), *case[4:])
+    expected = find_matches(*(array[:30] for array in case[:4]), *case[4:])
     for name in ("object_points", "scene_points", "weights", "mask"):
         np.testing.assert_array_equal(getattr(matches, name), getattr(expected, name))
 
 
 def test_traced_points_that_are_not_finite_never_vote():
     case = list(make_case())
-    case[1] = case[1].at[3, 0].set(jnp.nan)
-    case[2] = case[2].at[5, 0].set(jnp.inf)
+    case[1][3, 0], case[2][5, 0] = np.nan, np.inf
     mask = ~np.isin(np.arange(N), [3, 5])
     matches = jax.jit(find_matches)(*case)
     expected = jax.jit(find_matches)(*make_case(), mask)
@@ -135,9 +133,9 @@ def test_traced_points_that_are_not_finite_never_vote():
 
 def test_vmap_agrees_with_single_calls():
     cases = [make_case(seed) for seed in range(3)]
-    batch = jax.vmap(find_matches)(*(jnp.stack([jnp.asarray(x) for x in side]) for side in zip(*cases, strict=True)))
+    batch = jax.vmap(find_matches)(*(np.stack([np.float32(x) for x in side]) for side in zip(*cases, strict=True)))
     for row, case in enumerate(cases):
-        np.testing.assert_allclose(batch.weights[row], find_matches(*case).weights, rtol=1e-5)
+        np.testing.assert_allclose(np.asarray(batch.weights)[row], find_matches(*case).weights, rtol=1e-5)
 
 
 def test_bad_input_is_named():
@@ -148,13 +146,13 @@ def test_bad_input_is_named():
 
     bad = [
         (0, case[0][:, :1], "segmentation_logits has shape"),
-        (0, case[0].astype(jnp.int32), "segmentation_logits has dtype"),
+        (0, case[0].astype(np.int32), "segmentation_logits has dtype"),
         (1, case[1][0], "keypoint_logits has shape"),
         (1, case[1][:0], "keypoint_logits has shape"),
         (2, case[2][:5], "scene_points has shape"),
         (3, case[3][:, :2], "scene_normals has shape"),
         (4, case[4][:2], "keypoints has shape"),
-        (5, case[5] * jnp.inf, "keypoint_normals holds"),
+        (5, case[5] * np.float32(np.inf), "keypoint_normals holds"),
         (6, -1.0, "object_diameter is -1"),
     ]
     for position, value, message in bad:
