@@ -49,13 +49,14 @@ def trace_what_is_tested() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def sample_each_surface_once(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Keep the surfaces of a few meshes for what asks for them again, but where these are what is tested."""
-    from tests.reference.surfaces import kept_surface
+def make_each_object_once(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Keep surfaces and models of a few objects for what asks for them again, but where these are what is tested."""
+    from tests.reference.surfaces import kept_model, kept_surface
 
     with pytest.MonkeyPatch.context() as patch:
         if request.path.parent.name != "objects":
             patch.setattr("kmn_jax.objects._object_model.outer_surface", kept_surface)
+            patch.setattr("kmn_jax.objects._object_model._model", kept_model)
         yield
 
 

@@ -19,6 +19,7 @@ OPTIMISED = (
     "detection/test_bin_program.py",
     "models/test_released.py",
     "ros/test_results.py",
+    "experiments/test_train_verifier.py",
 )
 # The longest first. Training comes second, so that with two workers one compiles the search and the other reads it.
 LONGEST = (
