@@ -32,18 +32,16 @@ def synthetic_matches(
     inlier_share: float = 0.2,
     noise: float = 0.01,
     normal_noise: float = 0.1,
-    num_keypoints: int | None = None,
     diameter: float = 50.0,
 ) -> tuple[Matches, Pose]:
     """Draw matches of a box of which a share is right, and return them with the true T_scene_object.
 
     Right matches get Gaussian noise on the scene point (deviation `noise`, a fraction of the diameter) and on the
     normal (radians). Wrong ones pair a random object point with a random point and normal of the crop, a ball of
-    one diameter about a point of the object. With `num_keypoints`, every object point is replaced by the nearest
-    of so many random surface points, as a network that names keypoints would do. The object's frame
-    has its origin at the object's centre, so that the pose's translation is that of the centre.
+    one diameter about a point of the object. The object's frame has its origin at the object's centre, so that the
+    pose's translation is that of the centre.
     """
-    keys = jax.random.split(key, 11)
+    keys = jax.random.split(key, 9)
     points, normals = box_surface(keys[0], num_matches, diameter)
     rotation = random_rotation(keys[1])
     pose = from_rotation_translation(rotation, 10 * diameter * jax.random.normal(keys[2], (3,)))
@@ -57,13 +55,8 @@ def synthetic_matches(
     jitter = normal_noise * jax.random.normal(keys[7], (num_matches, 3))
     right_normals = _unit(rotate_vectors(pose, normals) + jitter)
 
-    if num_keypoints is not None:
-        keypoints, keypoint_normals = box_surface(keys[8], num_keypoints, diameter)
-        nearest = ((points[:, None, :] - keypoints[None, :, :]) ** 2).sum(axis=-1).argmin(axis=1)
-        points, normals = keypoints[nearest], keypoint_normals[nearest]
-
     is_right = jnp.arange(num_matches) < round(inlier_share * num_matches)
-    shuffle = jax.random.permutation(keys[9], num_matches)
+    shuffle = jax.random.permutation(keys[8], num_matches)
     is_right = is_right[shuffle][:, None]
     matches = Matches(
         object_points=points,
