@@ -75,7 +75,7 @@ def dense_logits(parameters: dict, crop: jax.Array, cloud: jax.Array, static: bo
 @pytest.mark.parametrize("seed", [1, 2])  # of seed 0, two neighbours in feature space are as near to within rounding
 def test_forward_is_the_dense_one(seed: int) -> None:
     model = small_model(seed, normalization="released")
-    crop, cloud = scene_crop(seed, 300), box_cloud(seed + 10, 280)
+    crop, cloud = scene_crop(seed, 150), box_cloud(seed + 10, 180)
     want = dense_logits(nnx.to_pure_dict(model.parameters), crop, cloud, static=False)
     assert_close(logits(model, crop, cloud), [np.asarray(x) for x in want])
 
@@ -87,7 +87,7 @@ def coarse(attention: str) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("inputs", "real", "changes"),
     [
-        *((inputs, real, {}) for inputs in ("raw", "invariant", "chiral") for real in (200, 30, 5)),
+        *((inputs, real, {}) for inputs in ("raw", "invariant", "chiral") for real in (100, 30, 5)),
         ("raw", 5, coarse("none")),
         *(("chiral", real, coarse("both")) for real in (30, 2)),
     ],
@@ -95,9 +95,9 @@ def coarse(attention: str) -> dict[str, object]:
 def test_padded_crop_equals_the_unpadded_one(inputs: str, real: int, changes: dict) -> None:
     """5 real points are fewer than the 8 neighbours asked for, 2 than the 3 coarse points that tell each other one."""
     model = small_model(normalization="metric", inputs=inputs, **changes)
-    crop, cloud = scene_crop(1, 300), box_cloud(11, 280)
+    crop, cloud = scene_crop(1, 150), box_cloud(11, 180)
     crop[real:] = np.nan
-    mask = np.arange(300) < real
+    mask = np.arange(150) < real
     got = logits(model, crop, cloud, 50.0, mask)
     assert_close([x[:real] for x in got], logits(model, crop[:real], cloud, 50.0))
     assert (got[0][real:].argmax(axis=1) == 0).all()
@@ -106,8 +106,8 @@ def test_padded_crop_equals_the_unpadded_one(inputs: str, real: int, changes: di
 
 def test_padding_may_lie_between_real_points() -> None:
     model = small_model(normalization="metric", inputs="invariant")
-    crop, cloud = scene_crop(1, 300), box_cloud(11, 280)
-    mask = np.arange(300) % 3 != 1
+    crop, cloud = scene_crop(1, 150), box_cloud(11, 180)
+    mask = np.arange(150) % 3 != 1
     want = logits(model, crop[mask], cloud, 50.0)
     crop[~mask] = np.inf
     assert_close([x[mask] for x in logits(model, crop, cloud, 50.0, mask)], want)
@@ -115,18 +115,18 @@ def test_padding_may_lie_between_real_points() -> None:
 
 def test_released_normalisation_ignores_padding_too() -> None:
     model = small_model(normalization="released")
-    crop, cloud = scene_crop(2, 350), box_cloud(12, 280)
-    crop[300:] = 1e4
-    got = logits(model, crop, cloud, None, np.arange(350) < 300)
-    assert_close([x[:300] for x in got], logits(model, crop[:300], cloud))
+    crop, cloud = scene_crop(2, 180), box_cloud(12, 180)
+    crop[150:] = 1e4
+    got = logits(model, crop, cloud, None, np.arange(180) < 150)
+    assert_close([x[:150] for x in got], logits(model, crop[:150], cloud))
 
 
 @pytest.mark.parametrize("changes", [{}, coarse("both")], ids=["fine", "coarse"])
 def test_vmap_equals_one_by_one(changes: dict) -> None:
     model = small_model(**changes)
-    crops = np.stack([scene_crop(seed, 300) for seed in range(4)])
-    masks = np.arange(300) < np.array([[300], [250], [150], [280]])
-    part = encode_object(model, box_cloud(3, 280), KEYPOINTS, 50.0)
+    crops = np.stack([scene_crop(seed, 150) for seed in range(4)])
+    masks = np.arange(150) < np.array([[150], [120], [75], [140]])
+    part = encode_object(model, box_cloud(3, 180), KEYPOINTS, 50.0)
     batched = jax.vmap(lambda crop, mask: match(model, encode_scene(model, crop, 50.0, mask), part))(crops, masks)
     for index in range(4):
         single = match(model, encode_scene(model, crops[index], 50.0, masks[index]), part)
@@ -135,8 +135,8 @@ def test_vmap_equals_one_by_one(changes: dict) -> None:
 
 def test_one_scene_against_several_objects() -> None:
     model = small_model()
-    scene = encode_scene(model, scene_crop(4, 200), 50.0)
-    parts = [encode_object(model, box_cloud(seed, 280), KEYPOINTS, 50.0) for seed in (5, 6)]
+    scene = encode_scene(model, scene_crop(4, 100), 50.0)
+    parts = [encode_object(model, box_cloud(seed, 180), KEYPOINTS, 50.0) for seed in (5, 6)]
     stacked = jax.tree.map(lambda *x: np.stack(x), *parts)
     batched = jax.vmap(lambda part: match(model, scene, part))(stacked)
     for index, part in enumerate(parts):
@@ -145,13 +145,13 @@ def test_one_scene_against_several_objects() -> None:
 
 def test_metric_scaling_does_not_know_the_unit() -> None:
     model = small_model(normalization="metric")
-    crop, cloud = scene_crop(5, 200), box_cloud(15, 280)
+    crop, cloud = scene_crop(5, 100), box_cloud(15, 180)
     metres = np.float32([1e-3] * 3 + [1] * 3)
     assert_close(logits(model, crop * metres, cloud * metres, 0.05), logits(model, crop, cloud, 50.0))
 
 
 def test_object_length_defaults_to_its_diameter() -> None:
-    cloud = box_cloud(6, 280)
+    cloud = box_cloud(6, 180)
     distances = np.linalg.norm(cloud[:, None, :3] - cloud[None, :, :3], axis=-1)
     part = encode_object(small_model(), cloud, KEYPOINTS)
     np.testing.assert_allclose(part.length, distances.max(), rtol=1e-5)
@@ -169,27 +169,27 @@ def rotated(x: np.ndarray) -> np.ndarray:
 )
 def test_invariant_inputs_do_not_know_the_rotation(changes: dict) -> None:
     model = small_model(graph="static", **changes)
-    crop, cloud = scene_crop(7, 200), box_cloud(17, 280)
+    crop, cloud = scene_crop(7, 100), box_cloud(17, 180)
     assert_close(logits(model, rotated(crop), rotated(cloud), 50.0), logits(model, crop, cloud, 50.0), 1e-3)
 
 
 @pytest.mark.parametrize("inputs", ["invariant", "chiral"])
 def test_invariant_inputs_hardly_know_the_rotation_in_a_dynamic_graph(inputs: str) -> None:
     model = small_model(inputs=inputs)
-    crop, cloud = scene_crop(7, 200), box_cloud(17, 280)
+    crop, cloud = scene_crop(7, 100), box_cloud(17, 180)
     a, b = logits(model, rotated(crop), rotated(cloud), 50.0), logits(model, crop, cloud, 50.0)
     assert (np.abs(a[0] - b[0]) < 1e-2 * np.ptp(b[0])).mean() > 0.98  # a feature-space near-tie may flip
 
 
 def test_static_graph_is_the_dense_network_on_the_coordinates_graph() -> None:
     model = small_model(graph="static")
-    crop, cloud = scene_crop(8, 300), box_cloud(18, 280)
+    crop, cloud = scene_crop(8, 150), box_cloud(18, 180)
     want = dense_logits(nnx.to_pure_dict(model.parameters), crop, cloud, static=True)
     assert_close(logits(model, crop, cloud, 50.0), [np.asarray(x) for x in want], 1e-5)
 
 
 def test_bfloat16_stays_close() -> None:
-    crop, cloud = scene_crop(9, 300), box_cloud(19, 280)
+    crop, cloud = scene_crop(9, 150), box_cloud(19, 180)
     exact = logits(small_model(graph="static"), crop, cloud, 50.0)
     model = small_model(graph="static", compute="bfloat16")
     half = logits(model, crop, cloud, 50.0)
@@ -262,7 +262,7 @@ def test_networks_of_before_are_called_what_they_were_called() -> None:
 
 def test_bad_input_gets_one_clear_error() -> None:
     model = small_model()
-    crop, cloud = scene_crop(0, 30), box_cloud(0, 280)
+    crop, cloud = scene_crop(0, 30), box_cloud(0, 180)
     broken = crop.copy()
     broken[7, 2] = np.nan
     infinite = cloud.copy()
@@ -283,7 +283,7 @@ def test_bad_input_gets_one_clear_error() -> None:
         (lambda: encode_scene(model, crop, mask=np.zeros(30, bool)), "no real point"),
         (lambda: encode_scene(model, crop, mask=np.zeros(29, bool)), "mask has shape"),
         (lambda: encode_scene(model, crop, mask=np.ones(30)), "must be bool"),
-        (lambda: encode_object(model, cloud, [0, 280]), r"outside of \[0, 280\)"),
+        (lambda: encode_object(model, cloud, [0, 180]), r"outside of \[0, 180\)"),
         (lambda: encode_object(model, cloud, [0.5]), "integers"),
         (lambda: encode_object(model, cloud, np.zeros(0, int)), "empty"),
         (lambda: encode_object(model, np.ones_like(cloud), KEYPOINTS), "no extent"),
@@ -304,7 +304,7 @@ def test_bad_input_gets_one_clear_error() -> None:
 
 def test_degenerate_crops_stay_finite() -> None:
     model = small_model()
-    cloud = box_cloud(0, 280)
+    cloud = box_cloud(0, 180)
     one = scene_crop(0, 1) + np.float32([1, 0, 0, 0, 0, 0])
     duplicated = np.repeat(scene_crop(0, 3), 10, axis=0)
     for given in (model, small_model(inputs="chiral", **coarse("both"))):
