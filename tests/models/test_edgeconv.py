@@ -1,81 +1,76 @@
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
 
-from benchmarks.reference import dense_jax
 from kmn_jax.models._edgeconv import EdgeConv
-from kmn_jax.models._layers import NormalizedLinear
-from tests.models.test_layers import signed_layer
+from tests.models.test_layers import layer_form
+from tests.reference.networks import signed
+
+call = jax.jit(EdgeConv.__call__, static_argnames="compute")
 
 
 def signed_block(in_features: int, depth: int, pair_features: int = 0) -> EdgeConv:
-    block = EdgeConv(in_features, 16, depth, 8, pair_features=pair_features, rngs=nnx.Rngs(0))
-    block.first = signed_layer(2 * in_features + pair_features, 16, 8, seed=1)
-    if depth == 2:
-        block.second = signed_layer(16, 16, 8, seed=2)
-    return block
+    return signed(lambda: EdgeConv(in_features, 16, depth, 8, pair_features=pair_features, rngs=nnx.Rngs(0)), 1)
 
 
-def dense_layer(x: jnp.ndarray, layer: NormalizedLinear) -> jnp.ndarray:
-    parameters = {"kernel": layer.kernel[...]}
-    parameters |= {
-        name: getattr(layer, name)[...].reshape((1,) * (x.ndim - 1) + (-1,)) for name in ("norm_scale", "norm_bias")
-    }
-    z = dense_jax.group_norm(x @ parameters["kernel"], parameters["norm_scale"], parameters["norm_bias"], layer.groups)
-    return jnp.where(z >= 0, z, 0.2 * z)
+@jax.jit
+def dense_block(block: EdgeConv, edges: jax.Array) -> jax.Array:
+    x = layer_form(block.first, edges)
+    return (layer_form(block.second, x) if block.second is not None else x).max(axis=1)
 
 
-def dense_block(block: EdgeConv, edges: jnp.ndarray) -> jnp.ndarray:
-    x = dense_layer(edges, block.first)
-    return (dense_layer(x, block.second) if block.second is not None else x).max(axis=1)
+def edges_of(x: np.ndarray, graph: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    return np.concatenate([x[graph] - centers[:, None], np.broadcast_to(centers[:, None], x[graph].shape)], axis=-1)
+
+
+def drawn(seed: int, points: int, shape: tuple[int, int], channels: int = 6) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and a graph."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(points, channels)).astype("f4"), rng.integers(0, points, shape)
 
 
 @pytest.mark.parametrize("depth", [1, 2])
 def test_equals_the_layer_on_concatenated_edges(depth: int) -> None:
-    rng = np.random.default_rng(depth)
-    x = jnp.asarray(rng.normal(size=(60, 6)), "f4")
-    graph = jnp.asarray(rng.integers(0, 60, (60, 9)))
+    x, graph = drawn(depth, 60, (60, 9))
     block = signed_block(6, depth)
-    np.testing.assert_allclose(block(x, graph, "float32"), dense_block(block, dense_jax.edges(x, graph)), atol=1e-5)
+    np.testing.assert_allclose(call(block, x, graph, "float32"), dense_block(block, edges_of(x, graph, x)), atol=1e-5)
 
 
 def test_pair_features_join_the_edges() -> None:
-    rng = np.random.default_rng(4)
-    x, pairs = jnp.asarray(rng.normal(size=(50, 2)), "f4"), jnp.asarray(rng.normal(size=(50, 7, 4)), "f4")
-    graph = jnp.asarray(rng.integers(0, 50, (50, 7)))
+    x, graph = drawn(4, 50, (50, 7), 2)
+    pairs = np.random.default_rng(5).normal(size=(50, 7, 4)).astype("f4")
     block = signed_block(2, 2, pair_features=4)
-    want = dense_block(block, jnp.concatenate([dense_jax.edges(x, graph), pairs], axis=-1))
-    np.testing.assert_allclose(block(x, graph, "float32", pair_features=pairs), want, atol=1e-5)
+    want = dense_block(block, np.concatenate([edges_of(x, graph, x), pairs], axis=-1))
+    np.testing.assert_allclose(call(block, x, graph, "float32", pair_features=pairs), want, atol=1e-5)
 
 
 def test_centers_may_be_few() -> None:
-    rng = np.random.default_rng(5)
-    x = jnp.asarray(rng.normal(size=(60, 6)), "f4")
-    rows = jnp.array([3, 50, 7])
-    graph = jnp.asarray(rng.integers(0, 60, (3, 9)))
+    x, graph = drawn(5, 60, (3, 9))
+    few = x[[3, 50, 7]]
     block = signed_block(6, 2)
-    edges = jnp.concatenate([x[graph] - x[rows][:, None, :], jnp.broadcast_to(x[rows][:, None, :], (3, 9, 6))], axis=-1)
-    np.testing.assert_allclose(block(x, graph, "float32", x[rows]), dense_block(block, edges), atol=1e-5)
+    want = dense_block(block, edges_of(x, graph, few))
+    np.testing.assert_allclose(call(block, x, graph, "float32", few), want, atol=1e-5)
 
 
 def test_masked_edges_count_in_no_statistic() -> None:
-    rng = np.random.default_rng(6)
-    x = jnp.asarray(rng.normal(size=(40, 6)), "f4")
-    graph = jnp.asarray(rng.integers(0, 40, (40, 5)))
+    x, graph = drawn(6, 40, (40, 5))
     block = signed_block(6, 2)
-    padded = jnp.concatenate([graph, jnp.broadcast_to(graph[:, :1], (40, 3))], axis=1)
-    mask = jnp.broadcast_to(jnp.arange(8)[None, :] < 5, (40, 8))
-    np.testing.assert_allclose(block(x, padded, "float32", edge_mask=mask), block(x, graph, "float32"), atol=1e-5)
+    padded = np.concatenate([graph, np.broadcast_to(graph[:, :1], (40, 3))], axis=1)
+    mask = np.broadcast_to(np.arange(8) < 5, (40, 8))
+    want = call(block, x, graph, "float32")
+    np.testing.assert_allclose(call(block, x, padded, "float32", edge_mask=mask), want, atol=1e-5)
 
 
 def test_complete_graph_forms_no_edge_and_is_the_same() -> None:
-    x = jnp.asarray(np.random.default_rng(7).normal(size=(20, 6)), "f4")
+    x = drawn(7, 20, (1, 1))[0]
     block = signed_block(6, 1)
-    everyone = jnp.broadcast_to(jnp.arange(20)[None, :], (20, 20))
-    np.testing.assert_allclose(block.complete_graph(x, "float32"), block(x, everyone, "float32"), atol=1e-5)
+    got = jax.jit(EdgeConv.complete_graph, static_argnames="compute")(block, x, "float32")
+    everyone = np.broadcast_to(np.arange(20), (20, 20))
+    np.testing.assert_allclose(got, call(block, x, everyone, "float32"), atol=1e-5)
 
 
 def test_unusable_depths_are_refused() -> None:

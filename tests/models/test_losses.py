@@ -8,6 +8,9 @@ import pytest
 from kmn_jax.errors import InputError
 from kmn_jax.models import LossConfig, keypoint_labels, matching_loss, spread_labels
 
+loss_of = jax.jit(matching_loss)
+shares_of = jax.jit(spread_labels, static_argnames="spread")
+
 
 def reference(segmentation, keypoint, on_object, labels):
     """Cross entropies by hand, in float64."""
@@ -34,7 +37,7 @@ def example(seed: int, n: int = 60, k: int = 7):
 @pytest.mark.parametrize("seed", range(3))
 def test_loss_and_accuracies_by_hand(seed: int) -> None:
     segmentation, keypoint, on_object, labels = example(seed)
-    loss = matching_loss(*map(jnp.asarray, (segmentation, keypoint, on_object, labels)))
+    loss = loss_of(segmentation, keypoint, on_object, labels)
     np.testing.assert_allclose(loss[:3], reference(segmentation, keypoint, on_object, labels), rtol=1e-5)
     np.testing.assert_allclose(loss.segmentation_accuracy, (segmentation.argmax(1) == on_object).mean(), rtol=1e-6)
     right = keypoint[on_object].argmax(1) == labels[on_object]
@@ -45,29 +48,27 @@ def test_loss_and_accuracies_by_hand(seed: int) -> None:
 def test_padding_and_background_labels_do_not_matter() -> None:
     segmentation, keypoint, on_object, labels = example(3)
     mask = np.arange(60) < 41
-    want = matching_loss(*(jnp.asarray(x[:41]) for x in (segmentation, keypoint, on_object, labels)))
+    want = loss_of(*(x[:41] for x in (segmentation, keypoint, on_object, labels)))
     labels = np.where(on_object & mask, labels, 10**6).astype("i4")
-    got = matching_loss(*map(jnp.asarray, (segmentation, keypoint, on_object, labels, mask)))
+    got = loss_of(segmentation, keypoint, on_object, labels, mask)
     np.testing.assert_allclose(got, want, rtol=1e-6)
 
 
 def test_no_object_point_means_no_keypoint_loss_and_no_nan() -> None:
     segmentation, keypoint, _, labels = map(jnp.asarray, example(4))
-
-    def total(logits):
-        return matching_loss(segmentation, logits, jnp.zeros(60, bool), labels).total
-
-    loss = matching_loss(segmentation, keypoint, jnp.zeros(60, bool), labels)
+    none = jnp.zeros(60, bool)
+    loss = loss_of(segmentation, keypoint, none, labels)
     assert float(loss.keypoint) == float(loss.keypoint_accuracy) == 0
     assert int(loss.num_object_points) == 0
-    assert bool((jax.grad(total)(keypoint) == 0).all())
+    gradient = jax.jit(jax.grad(lambda logits: matching_loss(segmentation, logits, none, labels).total))(keypoint)
+    assert (np.asarray(gradient) == 0).all()
 
 
 def test_labels_are_the_nearest_keypoints() -> None:
     rng = np.random.default_rng(5)
     points, keypoints = rng.normal(size=(50, 3)).astype("f4"), rng.normal(size=(6, 3)).astype("f4")
     distances = np.linalg.norm(points[:, None] - keypoints[None], axis=-1)
-    labels, distance = keypoint_labels(jnp.asarray(points), jnp.asarray(keypoints))
+    labels, distance = jax.jit(keypoint_labels)(points, keypoints)
     np.testing.assert_array_equal(labels, distances.argmin(axis=1))
     np.testing.assert_allclose(distance, distances.min(axis=1), rtol=1e-5)
 
@@ -82,31 +83,34 @@ def test_padding_reaches_neither_loss_nor_gradient() -> None:
     segmentation, keypoint, on_object, labels = map(jnp.asarray, example(6))
     mask = jnp.arange(60) < 41
 
+    @jax.jit
+    @jax.value_and_grad
     def total(logits: jax.Array) -> jax.Array:
         return matching_loss(segmentation, logits, on_object, labels, mask).total
 
-    broken = jnp.where(mask[:, None], keypoint, jnp.nan)
-    np.testing.assert_allclose(total(broken), total(keypoint), rtol=1e-6)
-    np.testing.assert_allclose(jax.grad(total)(broken), jax.grad(total)(keypoint), atol=1e-7)
+    broken = np.where(mask[:, None], keypoint, np.float32(np.nan))
+    (got, of_broken), (want, of_whole) = total(broken), total(keypoint)
+    np.testing.assert_allclose(got, want, rtol=1e-6)
+    np.testing.assert_allclose(of_broken, of_whole, atol=1e-7)
 
 
 def test_spread_labels_are_shared_by_keypoints_as_near_as_they_are() -> None:
-    keypoints = jnp.asarray(np.random.default_rng(0).normal(size=(7, 3)), "f4")
-    shares = np.asarray(spread_labels(keypoints, 0.5))
+    keypoints = np.random.default_rng(0).normal(size=(7, 3)).astype("f4")
+    shares = np.asarray(shares_of(keypoints, 0.5))
     np.testing.assert_allclose(shares.sum(axis=1), 1, rtol=1e-6)
     gap = np.linalg.norm(keypoints[2] - keypoints[5])
     np.testing.assert_allclose(shares[2, 5] / shares[2, 2], np.exp(-(gap**2) / (2 * 0.5**2)), rtol=1e-4)
-    np.testing.assert_allclose(spread_labels(keypoints, 1e-3), np.eye(7), atol=1e-6)
+    np.testing.assert_allclose(shares_of(keypoints, 1e-3), np.eye(7), atol=1e-6)
 
 
 def test_loss_with_shares_is_the_mean_of_losses_with_labels() -> None:
-    segmentation, keypoint, on_object, _ = map(jnp.asarray, example(7))
-    shares = spread_labels(jnp.asarray(np.random.default_rng(1).normal(size=(7, 3)), "f4"), 1.0)
-    label = jnp.full(60, 3, dtype=jnp.int32)
-    got = matching_loss(segmentation, keypoint, on_object, label, shares=shares)
-    each = [matching_loss(segmentation, keypoint, on_object, label * 0 + other).keypoint for other in range(7)]
-    np.testing.assert_allclose(got.keypoint, (np.asarray(shares[3]) * np.asarray(each)).sum(), rtol=1e-5)
-    same = matching_loss(segmentation, keypoint, on_object, label)
+    segmentation, keypoint, on_object, _ = example(7)
+    shares = np.asarray(shares_of(np.random.default_rng(1).normal(size=(7, 3)).astype("f4"), 1.0))
+    label = np.full(60, 3, dtype=np.int32)
+    got = loss_of(segmentation, keypoint, on_object, label, shares=shares)
+    each = [loss_of(segmentation, keypoint, on_object, label * 0 + other).keypoint for other in range(7)]
+    np.testing.assert_allclose(got.keypoint, (shares[3] * np.asarray(each)).sum(), rtol=1e-5)
+    same = loss_of(segmentation, keypoint, on_object, label)
     assert float(got.keypoint_accuracy) == float(same.keypoint_accuracy)
 
 

@@ -12,15 +12,19 @@ import pytest
 from flax import nnx
 
 from kmn_jax.errors import InputError
-from kmn_jax.models import create_model, encode_object, load_model, save_model
+from kmn_jax.models import Model, create_model, encode_object, load_model, model_structure, save_model
 from tests.reference.clouds import box_cloud
 from tests.reference.networks import TINY
 
 LEARNED = replace(TINY, object_branch="learned", object_digest="1" * 64)
 
 
-def test_the_cloud_counts_for_nothing_and_the_keypoints_are_its_own() -> None:
-    model = create_model(LEARNED, jax.random.key(0))
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return create_model(LEARNED, jax.random.key(0))
+
+
+def test_the_cloud_counts_for_nothing_and_the_keypoints_are_its_own(model: Model) -> None:
     clouds = [box_cloud(seed, 64).astype(np.float32) for seed in range(2)]
     one, other = (encode_object(model, cloud, np.arange(4)) for cloud in clouds)
     assert one.features.shape == (4, 8)
@@ -30,11 +34,10 @@ def test_the_cloud_counts_for_nothing_and_the_keypoints_are_its_own() -> None:
         encode_object(model, clouds[0], np.arange(3))
 
 
-def test_it_has_no_object_branch_and_its_features_get_gradients() -> None:
-    model, whole = (create_model(config, jax.random.key(0)) for config in (LEARNED, TINY))
-    sizes = [sum(leaf.size for leaf in jax.tree.leaves(one.parameters)) for one in (model, whole)]
+def test_it_has_no_object_branch_and_its_features_get_gradients(model: Model) -> None:
+    sizes = [sum(leaf.size for leaf in jax.tree.leaves(one.parameters)) for one in (model, model_structure(TINY))]
     assert sizes[0] < sizes[1]
-    crop = jnp.asarray(box_cloud(2, 64), jnp.float32)
+    crop = jnp.asarray(box_cloud(2, 64))
 
     def loss(parameters: nnx.State) -> jax.Array:
         network = nnx.merge(model.graphdef, parameters)
@@ -42,12 +45,11 @@ def test_it_has_no_object_branch_and_its_features_get_gradients() -> None:
         return segmentation[:, 1].sum() + (logits[:, 0] - logits[:, 1]).sum()
 
     gradient = jax.jit(jax.grad(loss))(model.parameters)
-    assert float(jnp.abs(gradient["keypoints"][...]).max()) > 0
-    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(gradient))
+    assert np.abs(gradient["keypoints"][...]).max() > 0
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
-def test_files_keep_it(tmp_path: Path) -> None:
-    model = create_model(LEARNED, jax.random.key(0))
+def test_files_keep_it(model: Model, tmp_path: Path) -> None:
     save_model(model, tmp_path / "one.safetensors")
     again = load_model(tmp_path / "one.safetensors")
     assert again.config == LEARNED
