@@ -26,8 +26,8 @@ _OTHERS_IN_SHORT = (
     "[other scenes](docs/detect.md#outside-of-these-bins): tables, trays, thick rims, mixed parts, other sensors"
 )
 _RELEASED = (
-    "what is released: whole searches, for up to three objects that are not there, told as if for a quarter; after that,"
-    " noisy images averaged, and searches that go on among what is found, for poses of 0.1"
+    "what is released: whole searches, for up to three objects that are not there, told as if for a quarter; after"
+    " that, noisy images averaged, and searches that go on among what is found, for poses of 0.1"
     " ([results](results/worlds_test.json))"
 )
 _SEARCHES = {
