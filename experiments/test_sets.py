@@ -141,8 +141,13 @@ def record_digests(digests: dict[str, str]) -> None:
 
 
 def made_with() -> dict[str, str]:
-    """Return what decides the last bit of a scene: library versions and the processor, which sums in its own order."""
-    return {"machine": platform.machine(), "processor": processor(), **{name: version(name) for name in _LIBRARIES}}
+    """Return what decides the last bit of a scene: library versions and the processor, which sums in its own order.
+
+    Processors of one name may differ in how many numbers they add at once.
+    """
+    found = np.show_config(mode="dicts").get("SIMD Extensions", {}).get("found", [])
+    made = {"machine": platform.machine(), "processor": processor(), "vectors": " ".join(found)}
+    return made | {name: version(name) for name in _LIBRARIES}
 
 
 def metric_model(path: Path) -> ObjectModel:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from experiments.solids import box, union
 from kmn_jax.detection import DepthAgreementConfig, DevicePart, Scene, make_scene, symmetry_transforms
 from kmn_jax.detection._look_alikes import MOST, look_alikes
-from kmn_jax.detection._polish import _polish_many, polish, polish_one
+from kmn_jax.detection._polish import _polish_many, polish, polish_one, polished
 from kmn_jax.detection._refinement import refined_forms
 from kmn_jax.geometry import Camera, SmoothConfig, crop_around, measured_points
 from kmn_jax.io import Scan
@@ -30,6 +30,7 @@ FORMS = jax.jit(refined_forms, static_argnames=("smooth", "agreement", "margin")
 CROP = jax.jit(crop_around, static_argnums=(4, 5))
 SEEN = jax.jit(visible_by_splatting)
 NO_RIVALS = np.zeros(MOST, dtype=bool)
+HALF_TURNS = np.tile(np.diag(np.float32([1, -1, -1, 1])), (MOST, 1, 1))
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +131,7 @@ def test_a_symmetry_is_no_look_alike() -> None:
 
 
 def device_of(part: Part, is_rival: np.ndarray = NO_RIVALS) -> DevicePart:
-    turns = turns_of(part)[0] if is_rival.any() else np.tile(np.eye(4, dtype=np.float32), (MOST, 1, 1))
+    turns = turns_of(part)[0] if is_rival.any() else HALF_TURNS  # which are not to be looked at then
     surfels = Surfels(jnp.asarray(part.points), jnp.asarray(part.normals), jnp.float32(part.area))
     arrays = PartArrays(surfels.points, surfels.normals, jnp.zeros((8, 4)), jnp.float32(part.diameter))
     return DevicePart(arrays, surfels, jnp.eye(4)[None], jnp.float32(0), jnp.asarray(turns), jnp.asarray(is_rival))
@@ -232,7 +233,8 @@ def test_many_are_polished_as_each_is(part: Part, scene: Scene) -> None:
     on_device = device_of(part)
     starts = np.stack([moved(TRUE, seed, 2.0, 0.015 * part.diameter) for seed in range(3)])
     found, many = polish(starts, on_device, scene.image), _polish_many(starts, on_device, scene.image)
-    wanted = [polish_one(start, on_device, scene.image) for start in starts]
+    alone = jax.jit(polished)
+    wanted = [alone(start, on_device, scene.image) for start in starts]
     for result in (found, many):
         np.testing.assert_allclose(result, wanted, atol=1e-4 * part.diameter)
     assert polish(starts[:0], on_device, scene.image).shape == (0, 4, 4)

@@ -124,7 +124,8 @@ def test_the_best_of_what_excludes_each_other_is_taken() -> None:
 
 def test_parts_too_far_apart_to_touch_are_two_also_if_all_that_is_known_of_one_is_its_inside() -> None:
     """From anywhere outside, a point is behind the nearest bit of a hollow ball, whose surface faces inwards."""
-    angle, height = np.arange(256) * 2.4, np.linspace(-0.99, 0.99, 256)
+    order = np.random.default_rng(0).permutation(256)  # the first of a part's points are spread over all of it
+    angle, height = order * 2.4, np.linspace(-0.99, 0.99, 256)[order]
     ring = np.sqrt(1 - height**2)
     ball = np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1).astype(np.float32)
     hollow = replace(BOX, points=ball, normals=-ball, minimum=-np.ones(3), maximum=np.ones(3), diameter=2.0, area=12.6)

@@ -32,9 +32,10 @@ from tests.reference.meshes import box
 
 SIZE = np.array([0.08, 0.05, 0.033])  # metres
 DIAMETER = float(np.linalg.norm(SIZE))
-# Each config is a program of its own, which takes seconds to compile: tests share these two.
+# Each config is a program of its own, which takes seconds to compile: tests share these.
 CONFIG = WorldConfig(background_points=4096, resolution=256, foreign=0.6, removed=0.0, half_removed=0.0)
-COPIES_WITHOUT_BIN = replace(CONFIG, foreign=0.0, rows=0.0, removed=1.0)
+COPIES_ON_A_TABLE = replace(CONFIG, foreign=0.0, tables=1.0, trays=0.0, rows=0.0, removed=1.0)
+MIXED_WITHOUT_BIN = replace(CONFIG, foreign=1.0, removed=1.0)
 make = jax.jit(make_world, static_argnames="config")
 lying = jax.jit(_lying)
 surfels_of = jax.jit(container_surfels, static_argnums=(2, 3))
@@ -86,7 +87,7 @@ def test_copies_do_not_go_through_one_another_nor_the_floor() -> None:
     # The map of heights knows cells, not surfaces: corners may sink in by about the width of one.
     allowed = 0.08 * DIAMETER
     for seed in range(12):
-        found = world(seed, COPIES_WITHOUT_BIN)
+        found = world(seed, COPIES_ON_A_TABLE)
         poses = found.T_camera_object.astype(np.float64)
         grid = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 7)] * 3), axis=-1).reshape(-1, 3) * SIZE
         seen = np.bincount(np.maximum(found.visible.instance[found.visible.mask], 0), minlength=len(poses)) > 0
@@ -100,12 +101,15 @@ def test_copies_do_not_go_through_one_another_nor_the_floor() -> None:
 
 def test_scenes_have_what_their_shares_say() -> None:
     for seed in range(6):
-        bare = world(seed, COPIES_WITHOUT_BIN).visible
-        assert not np.isin(bare.instance[bare.mask], (FOREIGN, BIN)).any()
-    kept = [world(seed).visible for seed in range(6)]
-    seen = [one.instance[one.mask] for one in kept]
-    assert any((instances == FOREIGN).any() for instances in seen)
-    assert all((instances == BIN).any() for instances in seen)
+        assert not (world(seed, COPIES_ON_A_TABLE).visible.instance == FOREIGN).any()
+    bare, kept = (
+        [one.instance[one.mask] for one in (world(seed, config).visible for seed in range(6))]
+        for config in (MIXED_WITHOUT_BIN, CONFIG)
+    )
+    assert not any((instances == BIN).any() for instances in bare)
+    assert all((instances == BIN).any() for instances in kept)
+    for seen in (bare, kept):
+        assert any((instances == FOREIGN).any() for instances in seen)
 
 
 def test_a_flat_part_lies_on_a_large_side() -> None:
