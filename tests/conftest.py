@@ -51,7 +51,7 @@ def trace_what_is_tested() -> Iterator[None]:
 @pytest.fixture(autouse=True, scope="module")
 def make_each_object_once(request: pytest.FixtureRequest) -> Iterator[None]:
     """Keep surfaces and models of a few objects for what asks for them again, but where these are what is tested."""
-    from tests.reference.surfaces import kept_model, kept_surface
+    from tests.reference.objects import kept_model, kept_surface
 
     with pytest.MonkeyPatch.context() as patch:
         if request.path.parent.name != "objects":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from copy import deepcopy
-from dataclasses import astuple, is_dataclass
+from dataclasses import is_dataclass
 from typing import Any
 
 import numpy as np
@@ -41,7 +41,7 @@ def _key(value: Any) -> Hashable:
     if isinstance(value, tuple):
         return tuple(_key(part) for part in value)
     if is_dataclass(value):
-        return _key(astuple(value))
+        return _key(tuple(vars(value).values()))
     return None if callable(value) else value
 
 
