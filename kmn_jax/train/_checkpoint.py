@@ -232,15 +232,18 @@ def _read_arrays(path: Path, layout: dict[str, Any]) -> dict[str, np.ndarray]:
 def _check_arrays(path: Path) -> None:
     """Raise any error if an array that orbax is going to read cannot be decoded.
 
-    It reads them side by side, and once one has failed, those that come later print tracebacks from its threads.
+    Once one has failed there, those that come later print tracebacks from its threads.
     """
     import tensorstore
 
-    place = {"driver": "ocdbt", "base": f"{path.as_uri()}/"}
-    for key in tensorstore.KvStore.open(place).result().list().result():
-        folder, _, name = key.decode().rpartition("/")
-        if name == ".zarray":
-            tensorstore.open({"driver": "zarr", "kvstore": {**place, "path": f"{folder}/"}}).result().read().result()
+    place, shared = {"driver": "ocdbt", "base": f"{path.as_uri()}/"}, tensorstore.Context()  # of the list of files
+    keys = tensorstore.KvStore.open(place, context=shared).result().list().result()
+    folders = [key.decode().removesuffix(".zarray") for key in keys if key.endswith(b"/.zarray")]
+    opened = [
+        tensorstore.open({"driver": "zarr", "kvstore": {**place, "path": folder}}, context=shared) for folder in folders
+    ]
+    for array in [array.result().read() for array in opened]:
+        array.result()
 
 
 def _checkpointer() -> Any:
