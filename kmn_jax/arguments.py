@@ -52,14 +52,18 @@ def _sentence(box: str) -> str:
     """Return what a box of the parser says of wrong arguments in one sentence, without the help texts in it."""
     box = re.sub(r"\x1b\[[\d;]*m", "", box)  # colours
     lines = [line[2:-1].rstrip() for line in box.splitlines()[1:] if not line.startswith("╰")]  # below its title
-    parts: list[list[str]] = [[]]
+    parts: list[tuple[list[str], list[str]]] = [([], [])]  # a text, and the options that it lists
     for line in lines:
+        text, options = parts[-1]
         if re.fullmatch("[─-]{3,}", line):
-            parts.append([])
+            parts.append(([], []))
         elif not line:  # what follows are details
             break
-        elif not line.startswith(" " * 5):  # where help texts are
-            parts[-1].append(line.strip())
-    said = "; ".join(" ".join(part).rstrip(".") for part in parts if part and not part[0].startswith("For full help"))
+        elif not line.startswith(" " * 4):
+            text.append(line)
+        elif not line.startswith(" " * 5) and line.strip() not in options:  # help texts; the same of two commands
+            options.append(line.strip())
+    told = [f"{' '.join(text)} {', '.join(options)}".strip().rstrip(".") for text, options in parts]
+    said = "; ".join(one for one in told if one and not one.startswith("For full help"))
     helped = re.search(r"kmn(?: \w+)? --help", box)
     return f"{said or box.strip()}: see {helped[0] if helped else 'kmn --help'}"

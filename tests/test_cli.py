@@ -53,13 +53,20 @@ def test_command_is_installed_and_explains_itself() -> None:
     assert main(["convert", "only-one"]) == 2
 
 
+UNITS = "{auto,mm,cm,m,in}"
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         ("", "Expected one of {prepare, detect, view, serve, export, convert}: see kmn --help"),
         ("nope", "Unrecognized options: nope"),
-        ("detect", "Missing from kmn detect: --object PATH --scene PATH: see kmn detect --help"),
-        ("detect --objct a --scene b", "Missing from kmn detect: --object PATH; Unrecognized options: --objct a"),
+        ("detect", "Missing from kmn detect: --object PATH, --scene PATH: see kmn detect --help"),
+        ("detect --objct a --scene b", "Missing from kmn detect: --object PATH; Unrecognized options: --objct, a"),
+        (
+            "detect --object a --scene b --unit mm",
+            f"Unrecognized options: --unit, mm; Perhaps you meant: --object-units {UNITS}, --units {UNITS}: see",
+        ),
         ("prepare", "Missing from kmn prepare: PATH"),
         ("prepare a b", "Unrecognized options: b"),
         ("detect --object a --scene b --top x", "Error parsing --top: "),
