@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial, wraps
 from typing import Any
 
@@ -14,6 +15,7 @@ import tyro
 from kmn_jax.errors import InputError
 
 _VECTORS = ("--at", "--sensor", "--roi")  # flags whose values may begin with a minus sign
+_SEVERAL = ("--at", "--allow-host")  # flags that may be given several times
 
 
 def joined(arguments: list[str]) -> list[str]:
@@ -33,12 +35,17 @@ def parsed(arguments: list[str], calls: Iterable[Callable[..., None]]) -> Callab
     Raises InputError, in one sentence, for wrong ones.
     """
 
+    flags = [argument.partition("=")[0] for argument in arguments if argument.startswith("--")]
+    repeated = next((flag for flag in flags if flags.count(flag) > 1 and flag not in _SEVERAL), None)
+    if repeated is not None:
+        raise InputError(f"{repeated} is given {flags.count(repeated)} times, but has one value: see kmn --help")
+
     def later(call: Callable[..., None]) -> Callable[..., Callable[[], None]]:
         return wraps(call)(lambda *values, **named: partial(call, *values, **named))
 
     said = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(said), _unwrapped({"-h", "--help"}.isdisjoint(arguments)):
             commands: dict[str, Any] = {call.__name__: later(call) for call in calls}
             chosen: Callable[[], None] = tyro.extras.subcommand_cli_from_dict(commands, prog="kmn", args=arguments)
             return chosen
@@ -46,6 +53,21 @@ def parsed(arguments: list[str], calls: Iterable[Callable[..., None]]) -> Callab
         if not error.code:  # of --help
             raise
     raise InputError(_sentence(said.getvalue()))
+
+
+@contextlib.contextmanager
+def _unwrapped(wanted: bool) -> Iterator[None]:
+    """Let the parser not break the lines of what it says of wrong arguments, in the middle of words if need be."""
+    before = os.environ.get("COLUMNS")
+    if wanted:
+        os.environ["COLUMNS"] = "10000"
+    try:
+        yield
+    finally:
+        if wanted and before is None:
+            del os.environ["COLUMNS"]
+        elif wanted:
+            os.environ["COLUMNS"] = str(before)
 
 
 def _sentence(box: str) -> str:

@@ -57,7 +57,7 @@ class Request:
     plane: Literal["auto", "always", "never"] = "auto"
     """Whether to leave out the largest plane, what is behind it, and a bin's walls; auto: if larger than the object."""
     effort: Literal["fast", "usual", "thorough"] = "usual"
-    """fast: seven tenths of the time, and fewer copies; thorough: some seven times, and perhaps a few more."""
+    """fast: seven tenths of the time, and fewer copies; thorough: some three times, and perhaps a few more."""
     sensor: str | None = None
     """X,Y,Z of the sensor in the scene's frame; the origin unless given."""
     base_camera: Path | None = None
@@ -86,8 +86,9 @@ def prepare(
     """
     from kmn_jax.detection import PoseEstimator, describe
     from kmn_jax.io import size_question
-    from kmn_jax.objects import save_part
+    from kmn_jax.objects import CARD_SUFFIX, save_part
 
+    require(output is None or output.suffix == CARD_SUFFIX, f"--output {output} must end in {CARD_SUFFIX}")
     target = output or source.parent / f"{source.stem}.kmn"
     check_outputs((target,), source, Path(weights))
     part = PoseEstimator.from_pretrained(weights).prepare(source, _unit(units))

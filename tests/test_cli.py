@@ -68,6 +68,8 @@ UNITS = "{auto,mm,cm,m,in}"
             f"Unrecognized options: --unit, mm; Perhaps you meant: --object-units {UNITS}, --units {UNITS}: see",
         ),
         ("prepare", "Missing from kmn prepare: PATH"),
+        ("detect --object a --scene b --object=c", "--object is given 2 times, but has one value"),
+        (f"prepare a {'long/' * 60}b", f"Unrecognized options: {'long/' * 60}b: see kmn"),
         ("prepare a b", "Unrecognized options: b"),
         ("detect --object a --scene b --top x", "Error parsing --top: "),
         ("detect --object a --scene b --plane x", "invalid choice 'x' for argument '--plane'"),

@@ -248,9 +248,11 @@ def test_bad_input_is_one_sentence_and_exit_2(
         assert error.count("\n") == 1, error
     assert main(["prepare", str(tmp_path / "nothing.stl")]) == 2
     assert main(["prepare", "."]) == 2
-    (tmp_path / "part.stl").write_bytes(MOTOR.read_bytes())
-    assert main(["prepare", str(tmp_path / "part.stl"), "-o", str(tmp_path / "part.stl")]) == 2
-    assert (tmp_path / "part.stl").read_bytes() == MOTOR.read_bytes()
+    for source, target in (("part.stl", "part.stl"), ("part.stl", "other.ply"), ("part.kmn", "part.kmn")):
+        for path in (tmp_path / target, tmp_path / source):
+            path.write_bytes(MOTOR.read_bytes())
+        assert main(["prepare", str(tmp_path / source), "-o", str(tmp_path / target)]) == 2
+        assert (tmp_path / target).read_bytes() == MOTOR.read_bytes()
 
 
 def test_what_pictures_need_is_asked_for_before_the_search(

@@ -165,7 +165,7 @@ def detect(
     result = Detections(part.name, scene.unit, poses, clock.timing, reason, warnings)
     if at is not None:
         return result
-    if not scene.is_narrowed:
+    if poses and not scene.is_narrowed:
         warnings = (*warnings, *narrowing(found.evidence[accepted], float(share)))
     return replace(result, warnings=warnings, unexplained=float(share), unexplained_points=points)
 

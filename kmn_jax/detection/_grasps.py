@@ -75,7 +75,7 @@ def with_grasps(
     """Return a result whose copies carry those of the grasps that are free, in the grasps' order.
 
     Of grasps that are the same up to the part's symmetry, the free one is taken that approaches most along the view.
-    Raises InputError if the gripper would be inside of the part itself at one of them.
+    Raises InputError if the gripper would be inside of the part itself at one of them, or nowhere near.
     """
     own = grasps.in_unit(scene.unit)
     check_on_part(own, part)
@@ -117,12 +117,22 @@ def with_grasps(
 
 
 def check_on_part(grasps: Grasps, part: Part) -> None:
-    """Raise InputError if the gripper would be inside of the part that it holds; lengths are in one unit."""
+    """Raise InputError if the gripper would be inside of the part that it holds, or nowhere near; lengths are in one
+    unit.
+    """
     from scipy.spatial import cKDTree
 
     surface = cKDTree(part.points)
     for one in grasps.grasps:
         centers, sizes = grasps.gripper.boxes(one.width)
+        seen = placed(np.linalg.inv(one.T_object_grasp), part.points)  # in the gripper's frame
+        beside = np.maximum(np.abs(seen[:, None] - centers[None]) - sizes[None] / 2, 0)
+        gap = float(np.linalg.norm(beside, axis=2).min())
+        if gap > part.diameter:
+            raise InputError(
+                f"at the grasp {one.name!r}, the gripper would be {gap / part.diameter:.1f} diameters away from"
+                f" {part.name}: check its pose, width, boxes and unit"
+            )
         places = placed(one.T_object_grasp, (centers[:, None] + _grid()[None] * sizes[:, None]).reshape(-1, 3))
         nearest = surface.query(places)[1]
         heights = ((places - part.points[nearest]) * part.normals[nearest]).sum(axis=1)

@@ -91,6 +91,12 @@ def test_grasps_of_a_symmetric_part_far_from_its_frame_s_origin_are_those_of_a_n
         np.testing.assert_allclose(one.grasps[0].T_scene_grasp, other.grasps[0].T_scene_grasp, atol=1e-5)
 
 
+@pytest.mark.parametrize("unit", ["mm", "cm", "in"])
+def test_grasps_in_a_unit_that_is_too_large_are_refused(unit: str) -> None:
+    with pytest.raises(InputError, match=r"the gripper would be \d+\.\d diameters away from box: .* and unit"):
+        with_grasps(FOUND, replace(grasps((BEHIND, SIZES[0])).in_unit(unit), unit="m"), PART, VIEW, None)
+
+
 def test_a_gripper_inside_of_its_own_part_is_refused() -> None:
     with pytest.raises(InputError, match=r"at the grasp 'way 2', \d+% of the gripper would be inside of box"):
         with_grasps(FOUND, grasps((np.eye(4), SIZES[0]), (ACROSS, 0.5 * SIZES[1])), PART, VIEW, None)
