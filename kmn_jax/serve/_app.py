@@ -8,9 +8,10 @@ from contextlib import asynccontextmanager
 from typing import Annotated, Any, Literal
 from urllib.parse import quote
 
-from fastapi import APIRouter, FastAPI, File, Form, Request, UploadFile
+from fastapi import APIRouter, Depends, FastAPI, File, Form, Request, UploadFile
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
+from fastapi.routing import APIRoute
 from starlette import datastructures
 from starlette.exceptions import HTTPException
 
@@ -38,6 +39,21 @@ _PROBLEMS: dict[int | str, dict[str, Any]] = {
 }
 _UNKNOWN: dict[int | str, dict[str, Any]] = {404: {"model": Problem, "description": "Not known"}}
 _PNG: dict[int | str, dict[str, Any]] = {200: {"content": {"image/png": {}}, "description": "The picture"}}
+
+_LISTS = ("at",)  # fields that may be sent several times
+
+
+async def only_known_fields(request: Request) -> None:
+    """Refuse a field that a request does not have, or has once: it would be ignored without a word."""
+    route, sent = request.scope["route"], [name for name, _ in (await request.form()).multi_items()]
+    assert isinstance(route, APIRoute)
+    known = [field.alias for field in route.dependant.body_params]
+    for name in sent:
+        if name not in known:
+            raise HTTPException(422, f"{name[:80]} is not known: the fields are {', '.join(known)}")
+        if sent.count(name) > 1 and name not in _LISTS:
+            raise HTTPException(422, f"{name} is sent {sent.count(name)} times, but has one value")
+
 
 router = APIRouter()
 
@@ -132,7 +148,11 @@ async def show_part(request: Request, name: str) -> PartInfo:
     return _info(name, _known(_service(request), name))
 
 
-@router.put("/parts/{name}", responses=_PROBLEMS | {201: {"model": PartInfo, "description": "A new part"}})
+@router.put(
+    "/parts/{name}",
+    responses=_PROBLEMS | {201: {"model": PartInfo, "description": "A new part"}},
+    dependencies=[Depends(only_known_fields)],
+)
 async def prepare_part(
     request: Request,
     response: Response,
@@ -160,7 +180,12 @@ async def delete_part(request: Request, name: str) -> None:
         raise HTTPException(404, _unknown(name))
 
 
-@router.post("/detect", response_model=DetectionResult, responses=_PROBLEMS | _UNKNOWN)
+@router.post(
+    "/detect",
+    response_model=DetectionResult,
+    responses=_PROBLEMS | _UNKNOWN,
+    dependencies=[Depends(only_known_fields)],
+)
 async def detect(
     request: Request,
     scene: Annotated[UploadFile, File(description="cloud or depth image")],
