@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import tyro
+
 from experiments.release import whole_rows
 from experiments.search_curve import PLAIN
 from kmn_jax.errors import InputError
@@ -103,7 +105,7 @@ def rewritten(text: str, rows_of: dict[str, list[list[str]]]) -> str:
 
 
 def main() -> None:
-    """Rewrite the tables."""
+    """Rewrite the tables of README.md, docs/detect.md and experiments/RESULTS.md from the committed results."""
     rows_of = tables()
     for name in DOCS:
         path = ROOT / name
@@ -186,6 +188,6 @@ def _significant(value: float) -> str:
 
 if __name__ == "__main__":
     try:
-        main()
+        tyro.cli(main)
     except InputError as problem:
         sys.exit(f"error: {problem}")

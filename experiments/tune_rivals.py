@@ -14,7 +14,7 @@ from experiments.evaluate import Options, compare, released_or_own, run
 from experiments.evaluation.cases import Method
 from experiments.evaluation.methods import ONE_RANSAC, Ours
 from experiments.evaluation.rivals import FastGlobal, FeatureSettings, Fpfh, Kiss, OverMatches, PointPairs
-from experiments.evaluation.tuned import RIVALS, without_package
+from experiments.evaluation.tuned import without_package
 from kmn_jax.errors import InputError
 from kmn_jax.models import Model
 
@@ -67,7 +67,7 @@ def _of_voxel(name: str, voxel: float, smooth: bool) -> Fpfh | Kiss:
 def tune(options: Options) -> Path:
     """Compare all settings of the rivals that are among the config's methods; return the path of the report's page."""
     model = released_or_own(options.config.weights)
-    there = (*RIVALS, "ours_open3d")
+    there = (*_VOXELS, "fgr", "ppf", "ours_open3d")  # the best of several poses are those of what is tuned
     names = [name for name in options.config.methods if name in there]
     skipped = without_package(names)
     methods = {key: method for name in names if name not in skipped for key, method in methods_of(name, model).items()}

@@ -115,7 +115,8 @@ class Export:
             problems = tuple(map(str, json.loads(metadata["problems"])))
             counts, poses = tensors["counts"], tensors["poses"]
             _check_shapes(tensors, poses=(int(counts.sum()), 4, 4), counts=(len(names),), copy=(len(names),))
-            _check_shapes(tensors, visible=(len(names),))
+            if tensors["visible"].shape != (len(names),):  # NaN where it is not known
+                raise ValueError(f"visible has shape {tensors['visible'].shape}")
             if counts.min(initial=0) < 0:
                 raise ValueError("counts below zero")
         except (KeyError, TypeError, ValueError, RecursionError) as error:

@@ -19,6 +19,7 @@ from experiments import ablate, evaluate, tune_rivals
 from experiments.evaluation import predictions, rivals
 from experiments.evaluation.cases import Case, ObjectImages, Solver, draw_cases
 from experiments.evaluation.configs import EvaluateConfig
+from experiments.evaluation.predictions import Export
 from experiments.evaluation.rivals import FastGlobal, Fpfh, Kiss, PointPairs, missing
 from experiments.evaluation.sources import bop_objects, cloud_objects
 from experiments.evaluation.tuned import RIVALS
@@ -207,6 +208,9 @@ def test_clouds_with_poses_are_evaluated_from_their_sensor(tmp_path: Path, gear:
         assert case.points[:, 2].min() > 0  # in front of the sensor
         local = (case.points[0] - pose[:3, 3]) @ pose[:3, :3]
         assert np.linalg.norm(found.model.points - local, axis=1).min() < 0.05 * found.model.diameter
+    exported = Export.open(tmp_path / "out", {}, overwrite=False)
+    exported.write_truth("part", 0.0, cases)
+    assert np.isnan(exported.truth("part", 0.0).visible).all()  # it is not known
 
 
 def test_an_ablation_changes_one_choice_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,7 +256,7 @@ def test_rivals_are_tuned_by_settings_side_by_side(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(tune_rivals, "_VOXELS", {"fpfh": ((0.05,), (0.05,)), "kiss": ((0.03,), (0.03,))})
     monkeypatch.setattr(rivals, "_SMOOTHED", (1024, 2048))  # of which each is compiled
     options = ["demo", "--objects", GEAR, "--images", "1", "--crops", "2", "--output", str(tmp_path / "out")]
-    assert tune_rivals.main(options) == 0
+    assert tune_rivals.main([*options, "--methods", "ours", "fpfh", "fpfh_best", "kiss"]) == 0
     recipe = json.loads((tmp_path / "out" / "scores.json").read_text())["recipe"]
     settings = recipe["methods"]
     tuned = {f"{name}{how}" for name in ("fpfh_0.05", "kiss_0.03") for how in ("", "_smoothed")}
