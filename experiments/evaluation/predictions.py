@@ -115,8 +115,9 @@ class Export:
             problems = tuple(map(str, json.loads(metadata["problems"])))
             counts, poses = tensors["counts"], tensors["poses"]
             _check_shapes(tensors, poses=(int(counts.sum()), 4, 4), counts=(len(names),), copy=(len(names),))
-            if tensors["visible"].shape != (len(names),):  # NaN where it is not known
-                raise ValueError(f"visible has shape {tensors['visible'].shape}")
+            visible = tensors["visible"]
+            if visible.shape != (len(names),) or np.isinf(visible).any():  # NaN where it is not known
+                raise ValueError(f"visible has shape {visible.shape}, or infinite values")
             if counts.min(initial=0) < 0:
                 raise ValueError("counts below zero")
         except (KeyError, TypeError, ValueError, RecursionError) as error:
