@@ -50,7 +50,7 @@ async def only_known_fields(request: Request) -> None:
     known = [field.alias for field in route.dependant.body_params]
     for name in sent:
         if name not in known:
-            raise HTTPException(422, f"{name[:80]} is not known: the fields are {', '.join(known)}")
+            raise HTTPException(422, f"{name[:80]!r} is not known: the fields are {', '.join(known)}")
         if sent.count(name) > 1 and name not in _LISTS:
             raise HTTPException(422, f"{name} is sent {sent.count(name)} times, but has one value")
 

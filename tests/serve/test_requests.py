@@ -186,7 +186,7 @@ def test_bad_input_is_one_sentence(server: Running, capfd: pytest.CaptureFixture
         (one | {"sensor": "nan,0,0"}, 400, "sensor is 'nan,0,0'"),
         (one | {"top": 0}, 400, "top is 0, but must be at least 1"),
         (one | {"units": "km"}, 422, "units: Input should be"),
-        (one | {"rio": "0,0,0,1,1,1"}, 422, "rio is not known: the fields are scene, part, object, camera, "),
+        (one | {"rio": "0,0,0,1,1,1"}, 422, "'rio' is not known: the fields are scene, part, object, camera, "),
         (one | {"top": ["1", "2"]}, 422, "top is sent 2 times, but has one value"),
         (one | {"random_seed": "x"}, 422, "random_seed: Input should be a valid integer"),
         ({"object": ("a.stl", b"solid")}, 422, "scene: Field required"),
