@@ -89,7 +89,7 @@ def prepare(
     from kmn_jax.objects import CARD_SUFFIX, save_part
 
     require(output is None or output.suffix == CARD_SUFFIX, f"--output {output} must end in {CARD_SUFFIX}")
-    target = output or source.parent / f"{source.stem}.kmn"
+    target = output or source.parent / f"{source.stem}{CARD_SUFFIX}"
     check_outputs((target,), source, Path(weights))
     part = PoseEstimator.from_pretrained(weights).prepare(source, _unit(units))
     save_part(part, target)

@@ -115,9 +115,8 @@ class Export:
             problems = tuple(map(str, json.loads(metadata["problems"])))
             counts, poses = tensors["counts"], tensors["poses"]
             _check_shapes(tensors, poses=(int(counts.sum()), 4, 4), counts=(len(names),), copy=(len(names),))
-            visible = tensors["visible"]
-            if visible.shape != (len(names),) or np.isinf(visible).any():  # NaN where it is not known
-                raise ValueError(f"visible has shape {visible.shape}, or infinite values")
+            known = {"visible": np.where(np.isnan(tensors["visible"]), 0, tensors["visible"])}
+            _check_shapes(known, visible=(len(names),))
             if counts.min(initial=0) < 0:
                 raise ValueError("counts below zero")
         except (KeyError, TypeError, ValueError, RecursionError) as error:
