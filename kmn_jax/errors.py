@@ -15,6 +15,8 @@ import numpy as np
 
 from kmn_jax.typing import ArrayInput
 
+_STEPS = 200  # across the size of points: with fewer, as float32 has far from the origin, their shape is lost
+
 
 class InputError(ValueError):
     """The caller's input cannot be used. The message is one sentence for people."""
@@ -35,6 +37,14 @@ def require(condition: bool, message: str) -> None:
     """Raise InputError with `message` unless the condition holds; for the checks of configs."""
     if not condition:
         raise InputError(message)
+
+
+def check_whole(value: object, name: str, low: int, high: int | None = None) -> None:
+    """Raise InputError unless `value` is a whole number from `low` to `high`, of Python or of NumPy."""
+    whole = int(value) if isinstance(value, int | np.integer) and not isinstance(value, bool) else None
+    if whole is None or whole < low or (high is not None and whole > high):
+        allowed = f"of {low} or more" if high is None else f"between {low} and {high}"
+        raise InputError(f"{name} is {shown(repr(value))}, but must be a whole number {allowed}")
 
 
 def number_list(text: str, name: str, *counts: int) -> list[float]:
@@ -84,13 +94,16 @@ def float_array(
     *,
     mask: jax.Array | None = None,
     finite: bool = True,
+    integers: bool = False,
 ) -> jax.Array:
     """Return `value` as a floating JAX array of `shape` (None = any length), or raise InputError.
 
     Rows where `mask` is false are padding and may hold anything; `finite` false allows infinity and NaN
-    everywhere. Float64 becomes the default float type.
+    everywhere, `integers` true takes whole numbers, too. Float64 becomes the default float type.
     """
     array = _array(value, name, shape)
+    if integers and jnp.issubdtype(array.dtype, jnp.integer):
+        array = array.astype(float)
     if not jnp.issubdtype(array.dtype, jnp.floating):
         raise InputError(f"{name} has dtype {array.dtype}, but must be floating point: convert it to float32")
     if finite and not is_traced(array) and not is_traced(mask) and not _is_finite(array, mask):
@@ -103,6 +116,41 @@ def float_array(
             f" the first at index {tuple(int(i) for i in row)}: remove such points first"
         )
     return array
+
+
+def point_array(value: ArrayInput, name: str, count: int | None = None, *, mask: jax.Array | None = None) -> jax.Array:
+    """Return points (count, 3) as `float_array` does; too far from the origin for float32, they raise InputError."""
+    array = float_array(value, name, (count, 3), mask=mask)
+    if not is_traced(array) and not is_traced(mask) and array.dtype != jnp.float64:
+        points = np.asarray(value, dtype=np.float64)
+        check_digits(points if mask is None else points[np.asarray(mask)], name)
+    return array
+
+
+def check_digits(points: np.ndarray, name: str) -> None:
+    """Raise InputError if points (n, 3) lie so far from the origin that float32 does not hold their shape."""
+    if not len(points):
+        return
+    farthest, size = float(np.abs(points).max()), float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
+    if is_coarse(farthest, size):
+        raise InputError(
+            f"{name} lies {farthest:.3g} from the origin, but is only {size:.3g} large, and float32 has not enough"
+            " digits for both: take its coordinates, and poses, relative to a place near to it"
+        )
+
+
+def is_coarse(farthest: float, size: float) -> bool:
+    """Tell whether float32, so far from the origin, does not hold the shape of what is of this size, if it has any."""
+    return size > 0 and float(np.spacing(np.float32(farthest))) > size / _STEPS
+
+
+def check_shape(value: ArrayInput, name: str, shape: tuple[int | None, ...]) -> None:
+    """Raise InputError unless `value` is an array of `shape` (None = any length); nothing is asked of its values."""
+    own = getattr(value, "shape", None)
+    if own is None:
+        raise InputError(f"{name} is a {type(value).__name__}, but must be an array of shape {_shown(shape)}")
+    if not _fits(own, shape):
+        raise InputError(f"{name} has shape {own}, but must have shape {_shown(shape)}")
 
 
 def row_count(value: ArrayInput, name: str) -> int:
@@ -138,7 +186,7 @@ def index_array(value: ArrayInput, name: str, length: int | None, upper: int) ->
 
 def positive_scalar(value: ArrayInput, name: str) -> jax.Array:
     """Return a finite float scalar above zero."""
-    array = float_array(jnp.asarray(value, dtype=float) if isinstance(value, int) else value, name, ())
+    array = float_array(value, name, (), integers=True)
     if not is_traced(array) and not float(array) > 0:
         raise InputError(f"{name} is {float(array):g}, but must be above zero")
     return array
@@ -146,7 +194,7 @@ def positive_scalar(value: ArrayInput, name: str) -> jax.Array:
 
 def rigid_pose(value: ArrayInput, name: str) -> jax.Array:
     """Return a (4, 4) matrix of a proper rotation and a translation, to the digits that pose files carry."""
-    array = float_array(value, name, (4, 4))
+    array = float_array(value, name, (4, 4), integers=True)
     if not is_traced(array):
         matrix = np.asarray(array, dtype=np.float64)
         rotation, last_row = matrix[:3, :3], matrix[3]
@@ -175,10 +223,16 @@ def _array(value: ArrayInput, name: str, shape: tuple[int | None, ...]) -> jax.A
     # What does not fit float32 becomes infinite, which is reported as such.
     with jax.ensure_compile_time_eval(), np.errstate(over="ignore"):
         array = value if isinstance(value, jax.Array) else jnp.asarray(_numbers(value, name))
-    if array.ndim != len(shape) or any(want not in (None, have) for want, have in zip(shape, array.shape, strict=True)):
-        wanted = ", ".join("any" if want is None else str(want) for want in shape)
-        raise InputError(f"{name} has shape {array.shape}, but must have shape ({wanted})")
+    check_shape(array, name, shape)
     return array
+
+
+def _fits(own: tuple[int, ...], shape: tuple[int | None, ...]) -> bool:
+    return len(own) == len(shape) and all(want in (None, have) for want, have in zip(shape, own, strict=True))
+
+
+def _shown(shape: tuple[int | None, ...]) -> str:
+    return f"({', '.join('any' if want is None else str(want) for want in shape)})"
 
 
 def _numbers(value: ArrayInput, name: str) -> np.ndarray:

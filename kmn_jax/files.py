@@ -87,6 +87,13 @@ def lock(file: BinaryIO | int) -> bool:
     return True
 
 
+def check_inputs(*paths: Path | None) -> None:
+    """Raise InputError if a file to read is missing: before the time is taken to read the others."""
+    for path in paths:
+        if path is not None and not os.path.exists(path):
+            raise InputError(f"{path} cannot be read: No such file or directory")
+
+
 def check_outputs(paths: Iterable[Path | None], *read: Path | None) -> None:
     """Raise InputError if a file cannot be written, is one of those that are `read`, or is to hold two results."""
     named: set[str] = set()

@@ -13,11 +13,12 @@ import hashlib
 import inspect
 import os
 import shutil
-from collections.abc import Callable
+import signal
+import threading
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, cached_property, update_wrapper
 from pathlib import Path
-from threading import Lock
 from typing import Any, Generic, ParamSpec, TypeVar, cast
 
 import jax
@@ -91,6 +92,27 @@ def read_kept() -> None:
     """Begin to read what is kept, if anything is; call it once the modules are imported whose programs these are."""
     if _store is not None:
         _store.begin()
+
+
+def is_nothing_kept() -> bool:
+    """Tell, after `read_kept`, whether programs are to be kept, but none was: then everything has to be compiled."""
+    return _store is not None and not _store.read
+
+
+@contextlib.contextmanager
+def ended_by_interrupt() -> Iterator[None]:
+    """Let Ctrl+C end the process at once: Python would take notice of it when compiling has ended.
+
+    Nothing that is being written appears in part (see `write_whole`). In other threads than the first it does nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def meanwhile(work: Callable[..., object], *args: Any) -> None:
@@ -182,7 +204,7 @@ class _Store:
         os.utime(self.folder)
         _forget_old(folder)
         self.programs: dict[Any, Future[Callable[..., Any] | None]] = {}
-        self.lock = Lock()
+        self.lock = threading.Lock()
         self.read: dict[str, Future[Any]] = {}
 
     def begin(self) -> None:

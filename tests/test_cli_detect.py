@@ -261,7 +261,7 @@ def test_what_pictures_need_is_asked_for_before_the_search(
     def search(request: object) -> None:
         raise AssertionError("searched")
 
-    monkeypatch.setattr("kmn_jax.cli._Session", search)
+    monkeypatch.setattr("kmn_jax.cli.Session", search)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     outputs = ["--json", str(tmp_path / "a.json"), "--save-picture", str(tmp_path / "a.png")]
     assert main(["detect", "--object", str(MOTOR), "--scene", str(IMAGE), *outputs]) == 2
@@ -291,7 +291,7 @@ def test_results_are_written_though_nobody_reads_the_table(
     def closed(found: Detections, accepted: float) -> str:
         raise BrokenPipeError
 
-    monkeypatch.setattr("kmn_jax.cli._Session", Session)
+    monkeypatch.setattr("kmn_jax.cli.Session", Session)
     monkeypatch.setattr("kmn_jax.detection.table", closed)
     target = tmp_path / "a.json"
     with (tmp_path / "out").open("w") as out:

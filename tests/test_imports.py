@@ -26,6 +26,7 @@ ROOMS = (
     "detection",
     "viz",
     "serve",
+    "session",
     "cli",
 )
 RANKS = dict.fromkeys(

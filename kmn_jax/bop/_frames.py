@@ -19,7 +19,7 @@ Box: TypeAlias = tuple[int, int, int, int]  # left, top, width, height in pixels
 _NO_BOX = (-1, -1, -1, -1)  # how BOP writes the box of nothing
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BopInstance:
     """One object in a frame. Its visibility is None where the dataset does not tell it."""
 
@@ -37,7 +37,7 @@ class BopInstance:
             raise InputError(f"visible_fraction is {self.visible_fraction}, but must be between 0 and 1")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BopFrame:
     """One image of a dataset, all lengths in one unit. What the dataset does not have is None."""
 

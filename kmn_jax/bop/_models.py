@@ -18,7 +18,7 @@ NAMES_FILE = "object_names.json"  # ours: BOP objects have numbers only
 _INFO_FILE = "models_info.json"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BopModel:
     """What a dataset tells of an object; the mesh itself is read from `path`, in millimetres."""
 

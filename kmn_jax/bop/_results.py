@@ -18,7 +18,7 @@ _HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 _SAME_TIME = 1e-3  # seconds; the tolerance of the benchmark's own check
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BopEstimate:
     """One estimated pose."""
 

@@ -28,7 +28,7 @@ _METADATA = "kmn_jax.pack"
 _LEVELS = 32767
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Drop:
     """One bin scene of an object, and which surfels its camera sees: 8 a byte, the lowest bit first."""
 
@@ -37,7 +37,7 @@ class Drop:
     bin_bits: UInt8[np.ndarray, " b8"] | None = None  # of `kmn_jax.simulate._splat.bin_surfels`
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PackedObject:
     """An object of a pack. Lengths are in metres.
 

@@ -10,7 +10,7 @@ from typing import Literal, overload
 import numpy as np
 from jaxtyping import Float
 
-from kmn_jax.bop import bop_object, bop_scan, bop_scene_id, is_bop_image
+from kmn_jax.bop import is_bop_image
 from kmn_jax.detection._calibration import Probabilities, calibration_beside, load_probabilities
 from kmn_jax.detection._coverage import unexplained
 from kmn_jax.detection._detect import DetectConfig, detect
@@ -30,19 +30,19 @@ from kmn_jax.detection._sources import (
     grasps_of,
     is_unit_assumed,
     object_of,
+    parts_of,
+    places_of,
+    read_source,
     unit_words,
 )
 from kmn_jax.detection._timing import Clock
-from kmn_jax.errors import InputError, float_array
+from kmn_jax.errors import InputError, check_whole, float_array
 from kmn_jax.io import (
     CameraMatrix,
     Scan,
     camera_question,
-    held,
     length_doubt,
     length_problem,
-    read_scan,
-    resolve_unit,
     scene_size,
     size_question,
 )
@@ -128,12 +128,15 @@ class PoseEstimator:
 
         See `detect` for the arguments.
         """
-        parts = sorted([part] if isinstance(part, Part) else part, key=lambda one: one.in_unit("m").diameter)
+        parts = sorted(parts_of(part), key=lambda one: one.in_unit("m").diameter)
         if not parts:
             raise InputError("no object is given to make the scene for")
         smallest, ratio = parts[0], parts[-1].in_unit("m").diameter / parts[0].in_unit("m").diameter
+        if sensor is not None:
+            float_array(sensor, "sensor", (3,), integers=True)
+            sensor = np.asarray(sensor, dtype=np.float64)
         given = arranged(scan, K, depth_unit, camera, unit)
-        read, truth, bop_ids = _read(given, unit, camera, smallest)
+        read, truth, bop_ids = read_source(given, unit, camera, smallest)
         frame = scan_frame(read, sensor, T_scene_camera)
         size = scene_size(read)
         words = unit_words(scan, K, unit)
@@ -142,13 +145,15 @@ class PoseEstimator:
             raise InputError(problem)
         is_stated = camera is None and isinstance(scan, str | Path) and is_bop_image(scan)
         question = size_question(smallest.diameter, smallest.unit, words.object)
-        options = background or ForegroundOptions()
+        options = ForegroundOptions() if background is None else background
+        if not isinstance(options, ForegroundOptions):
+            raise InputError(
+                f"background is a {type(options).__name__}, but must be ForegroundOptions: an empty bin is theirs"
+            )
         # Margins are those of the smallest part, but a plane is background only if it is no part's.
         options = replace(options, least_extent=options.least_extent * ratio)
         diameter = smallest.in_unit(read.unit).diameter
-        if sensor is not None:
-            float_array(np.asarray(sensor, dtype=np.float64), "sensor", (3,))
-        scene = make_scene(read, diameter, sensor=frame.sensor, background=options, keep=_places(at))
+        scene = make_scene(read, diameter, sensor=frame.sensor, background=options, keep=places_of(at))
         return replace(
             scene,
             warnings=(*self.warnings, *filter(None, (question,)), *frame.warnings, *scene.warnings),
@@ -174,7 +179,7 @@ class PoseEstimator:
         depth_unit: Unit | float | None = None,
     ) -> Scan:
         """Read a scan as `scene` does, such as that of an empty bin."""
-        return _read(arranged(scan, K, depth_unit, camera, unit), unit, camera, part)[0]
+        return read_source(arranged(scan, K, depth_unit, camera, unit), unit, camera, part)[0]
 
     @overload
     def detect(
@@ -256,7 +261,7 @@ class PoseEstimator:
         Raises InputError if lengths of part and scan cannot belong together, if nothing of the scan is foreground, or
         if nothing was measured near to one of the places.
         """
-        parts = [part] if isinstance(part, Part) else list(part)
+        parts = parts_of(part)
         if not parts:
             return ()
         for one in parts:
@@ -264,12 +269,11 @@ class PoseEstimator:
                 raise InputError(
                     f"the object {one.name} was prepared with other weights: prepare it with this estimator"
                 )
-        if not 0 <= random_seed <= _MOST_SEED:
-            raise InputError(f"random_seed is {random_seed}, but must be between 0 and {_MOST_SEED}")
-        if top is not None and top < 1:
-            raise InputError(f"top is {top}, but must be at least 1")
+        check_whole(random_seed, "random_seed", 0, _MOST_SEED)
+        if top is not None:
+            check_whole(top, "top", 1)
         clock = clock or Clock()
-        places, ways = _places(at), grasps_of(grasps, len(parts))
+        places, ways = places_of(at), grasps_of(grasps, len(parts))
         if isinstance(scan, Scene):
             given = (camera, unit, K, depth_unit, sensor, T_scene_camera, background)
             if any(value is not None for value in given):
@@ -349,13 +353,6 @@ def _points_of(empty: Scan, scene: Scene) -> Float[np.ndarray, "e 3"]:
     return into(scene.T_scene_camera, empty.in_unit(scene.unit).points).astype(np.float32)
 
 
-def _places(at: Float[np.ndarray, "*k 3"] | None) -> Float[np.ndarray, "k 3"] | None:
-    if at is None:
-        return None
-    float_array(np.atleast_2d(at), "at", (None, 3))
-    return np.atleast_2d(np.asarray(at, dtype=np.float64))
-
-
 def _check_near(scene: Scene, places: Float[np.ndarray, "k 3"], reach: float) -> None:
     """Raise InputError if nothing was measured near to one of the places, which are in the camera's frame."""
     for number, place in enumerate(places):
@@ -365,29 +362,3 @@ def _check_near(scene: Scene, places: Float[np.ndarray, "k 3"], reach: float) ->
                 f"place {number + 1} to search at is {away:.4g} {scene.unit} away from the nearest measured point,"
                 " farther than the object is large: give a point of the scan"
             )
-
-
-def _read(
-    source: ScanSource, unit: str | None, camera: str | Path | None, part: Part
-) -> tuple[Scan, tuple[Float[np.ndarray, "4 4"], ...] | None, tuple[int, int, int]]:
-    """Return a scan; of an image of a BOP dataset also the true poses of a part, if known, and what it is called."""
-    nothing, asked = (0, 0, 1), unit or "auto"
-    if isinstance(source, Scan):
-        return source, None, nothing
-    if isinstance(source, str | Path):
-        path = Path(source)
-        if camera is not None or not is_bop_image(path):
-            return read_scan(path, resolve_unit(asked, part.unit), camera), None, nothing
-        scan, instances = bop_scan(path, resolve_unit(asked, part.unit, "mm"))
-        inside = part.in_unit("mm")
-        alike = bop_object(path, instances, inside.diameter, inside.maximum - inside.minimum)
-        ids = (bop_scene_id(path), int(path.stem), 1 if alike is None else alike)
-        if alike is None:
-            return scan, None, ids
-        copies = [instance for instance in instances or () if instance.object_id == alike]
-        return scan, tuple(instance.T_camera_object for instance in copies), ids
-    single = np.asarray(float_array(source, "scan", (None, 3), finite=False), dtype=np.float32)
-    real = np.isfinite(single).all(axis=1) & (single != 0).any(axis=1)
-    if not real.any():
-        raise InputError(f"none of the scan's {len(single)} points was measured: all are NaN, infinite or zero")
-    return Scan(held(np.asarray(source)[real]), None, None, None, resolve_unit(asked, part.unit)), None, nothing

@@ -27,6 +27,7 @@ Box = tuple[float, float, float, float, float, float]
 
 _BEHIND = 0.15  # share of the points: with more behind it, a plane is no floor, but the tops of parts, or a rim
 _LEFT = 0.01  # share of the points in front of a floor without which it may be the parts themselves
+_HARDLY = 0.01  # share of the points: an empty bin that takes fewer away is hidden, or that of other scans
 _PLANES = 3  # one behind the other, among which a floor is looked for
 _HINT = ": if it is the floor, give a region of interest (--roi) or the empty bin (--background)"
 
@@ -125,6 +126,12 @@ def foreground(
         kept &= _off_background(scan, options.background, pose, diameter, options.background_margin)
         if not kept.any():
             raise InputError(f"all {before} points are those of the empty bin, or too near to it: is it really empty?")
+        share = 1 - kept.sum() / before
+        if share < _HARDLY:
+            warnings.append(
+                f"the scan of the empty bin takes only {share:.1%} of the points away, as it lies elsewhere: is it in"
+                " the frame and unit of this scan?"
+            )
     wanted = options.remove_plane == "always" or (options.remove_plane == "auto" and options.background is None)
     if wanted:
         chosen, margin = np.flatnonzero(kept), options.plane_margin * diameter

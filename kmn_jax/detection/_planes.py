@@ -16,7 +16,7 @@ _ROUNDED = 16  # points: by as many fewer in single precision, a plane may still
 _NEAR = 64  # neighbours in the sample, of which a local triple is made
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Plane:
     """Points x with normal · x = offset. Where the offset is not below zero, behind the plane, seen from the sensor at
     the origin, is above it."""

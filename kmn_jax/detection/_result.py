@@ -14,7 +14,7 @@ _SHOWN = 12  # poses in what is printed of a result: it should fit on a screen
 _RUNS = 8  # of ranks that a warning is told with
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CropPrediction:
     """What the network says of the n points around a seed."""
 
@@ -23,7 +23,7 @@ class CropPrediction:
     keypoint: Int[np.ndarray, " n"]  # the likeliest; means nothing where on_object is false
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pick:
     """A grasp of a found copy at which the gripper touches nothing that was measured."""
 
@@ -42,7 +42,7 @@ class Pick:
         }
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Detection:
     """One found copy of a part.
 
@@ -109,7 +109,7 @@ class Timing:
         return Timing({**self.stages, **later.stages}, self.compile + later.compile)
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Detections:
     """The copies of a part in a scene, in pick order: likely and unhidden ones first."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -20,6 +21,11 @@ _OPENGL = (
 )
 
 
+_OFF_CENTRE = 0.15  # of an image's width or height: so far from its middle, no lens is mounted
+_WIDEST = 130.0  # degrees that the widest depth cameras see, along the diagonal
+_STRAY = 1  # per cent of the points
+
+
 class ScanFrame(NamedTuple):
     """What is known of the camera in the frame of a scan."""
 
@@ -32,12 +38,14 @@ class ScanFrame(NamedTuple):
 def scan_frame(scan: Scan, sensor: Float[np.ndarray, "3"] | None, T_scene_camera: ArrayInput | None) -> ScanFrame:
     """Return where a scan's camera was: at the origin unless a place or a pose is given.
 
-    Raises InputError for both at once, for a depth image with either, and if points lie behind the camera.
+    It warns of what camera and points can hardly be to each other. Raises InputError for both at once, for a depth
+    image with either, and if points lie behind the camera.
     """
     if T_scene_camera is None:
         backwards = scan.camera is None and sensor is None and bool((scan.points[:, 2] < 0).all())
         note = f"{_OPENGL[0]}: poses are given in that frame; for those in the camera's usual frame, {_OPENGL[1]}"
-        return ScanFrame(np.eye(4) if sensor is None else None, sensor, (note,) if backwards else (), backwards)
+        notes = (*((note,) if backwards else ()), *_questions(scan, sensor))
+        return ScanFrame(np.eye(4) if sensor is None else None, sensor, notes, backwards)
     if sensor is not None:
         raise InputError("T_scene_camera says where the sensor was: leave sensor out")
     if scan.camera is not None:
@@ -49,7 +57,31 @@ def scan_frame(scan: Scan, sensor: Float[np.ndarray, "3"] | None, T_scene_camera
             f"{behind:.0%} of the points lie behind the camera of T_scene_camera: give the camera's pose in the frame"
             " of the points, z forward (its inverse, or axes of OpenGL, look like this)"
         )
-    return ScanFrame(pose, pose[:3, 3], ())
+    return ScanFrame(pose, pose[:3, 3], tuple(_questions(scan, pose[:3, 3])))
+
+
+def _questions(scan: Scan, sensor: Float[np.ndarray, "3"] | None) -> Iterator[str]:
+    """Ask of a camera that is known whether it is this image's, of one that is not whether it can have been there."""
+    if scan.camera is not None:
+        camera = scan.camera
+        off = np.abs([camera.cx / camera.width - 0.5, camera.cy / camera.height - 0.5])
+        if off.max() > _OFF_CENTRE:
+            yield (
+                f"the camera's cx, cy = {camera.cx:g}, {camera.cy:g} lie far from the middle of the image of"
+                f" {camera.width} x {camera.height} pixels: are fx, fy, cx and cy those of an image of this size?"
+            )
+        return
+    offsets = scan.points - (np.zeros(3) if sensor is None else sensor)
+    directions = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+    middle = directions.mean(axis=0)
+    cosines = directions @ middle / max(float(np.linalg.norm(middle)), 1e-6)
+    half = float(np.degrees(np.arccos(np.clip(np.percentile(cosines, _STRAY), -1, 1))))
+    if half > _WIDEST / 2:
+        where = "the origin, where the sensor is taken to have been" if sensor is None else "the sensor's place"
+        yield (
+            f"as seen from {where}, the points fill an angle of {2 * half:.0f} degrees, more than sensors see: say"
+            " where in the frame of the points it was (--sensor, in Python sensor=)"
+        )
 
 
 def base_from_scene(

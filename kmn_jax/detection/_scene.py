@@ -27,7 +27,7 @@ _NEAREST = 1e-3  # of the distance of the cloud: a sensor nearer than that to a 
 _FARTHEST = 1e4  # diameters of an object, from the sensor: beyond, float32 does not hold its surface
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """A scan as searches take it. The camera is the sensor, z forward; lengths are in `unit`."""
 

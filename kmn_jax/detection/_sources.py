@@ -1,4 +1,4 @@
-"""What parts and scans can be given as, beside files."""
+"""What parts, scans, grasps and places can be given as, and each as what is computed with."""
 
 from __future__ import annotations
 
@@ -7,13 +7,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
+from jaxtyping import Float
 
-from kmn_jax.errors import InputError
-from kmn_jax.io import CameraMatrix, Scan, UnitWords, depth_array_scan, stated_unit
+from kmn_jax.bop import bop_object, bop_scan, bop_scene_id, is_bop_image
+from kmn_jax.errors import InputError, float_array
+from kmn_jax.io import (
+    CameraMatrix,
+    Scan,
+    UnitWords,
+    depth_array_scan,
+    held,
+    read_scan,
+    resolve_unit,
+    stated_unit,
+)
 from kmn_jax.objects import (
     Grasps,
     ObjectConfig,
     ObjectModel,
+    Part,
     load_grasps,
     load_object,
     object_from_cloud,
@@ -71,10 +83,12 @@ def arranged(
 
 def unit_words(scan: ScanSource, K: CameraMatrix | None, unit: str | None) -> UnitWords:
     """Return what says the units of part and scan in such a call: the command's, and only it, has a unit of files."""
-    if isinstance(scan, str | Path) and unit is not None:
-        return UnitWords()
-    by = "unit" if K is None else "depth_unit"
-    return UnitWords(f'{by}="{{}}"' + (" of the Scan" if isinstance(scan, Scan) else ""), 'unit="{}" to prepare')
+    part = 'unit="{}" to prepare'
+    if isinstance(scan, str | Path):
+        return UnitWords() if unit is not None else UnitWords('unit="{}"', part)
+    if K is not None:
+        return UnitWords('depth_unit="{}"', part, "depth_unit in metres for one step")
+    return UnitWords('unit="{}"' + (" of the Scan" if isinstance(scan, Scan) else ""), part, None)
 
 
 def grasps_of(given: GraspSource | Sequence[GraspSource | None] | None, count: int) -> list[Grasps | None]:
@@ -114,3 +128,52 @@ def object_of(source: PartSource, unit: str | None, name: str | None, config: Ob
         raise InputError(f"the object's cloud has shape {cloud.shape}, but must be (n, 3), or (n, 6) with normals")
     normals = cloud[:, 3:].astype(np.float64) if cloud.shape[1] == 6 else None
     return object_from_cloud(name, cloud[:, :3].astype(np.float64), normals, unit, config)
+
+
+def places_of(at: ArrayInput | None) -> Float[np.ndarray, "k 3"] | None:
+    """Return places to search at, one (3,) or several (k, 3), as rows in double precision."""
+    if at is None:
+        return None
+    rows = np.atleast_2d(at)
+    float_array(rows, "at", (None, 3), integers=True)
+    return rows.astype(np.float64)
+
+
+def parts_of(given: Part | Sequence[Part]) -> list[Part]:
+    """Return one part or several as a list. Raises InputError for what is none, such as a file's name."""
+    parts = list(given) if isinstance(given, Sequence) and not isinstance(given, str) else [given]
+    for one in parts:
+        if not isinstance(one, Part):
+            raise InputError(
+                f"a {type(one).__name__} is no Part to search: make one with prepare, of a file or of arrays"
+            )
+    return parts
+
+
+def read_source(
+    source: ScanSource, unit: str | None, camera: str | Path | None, part: Part
+) -> tuple[Scan, tuple[Float[np.ndarray, "4 4"], ...] | None, tuple[int, int, int]]:
+    """Return a scan; of an image of a BOP dataset also the true poses of a part, if known, and what it is called.
+
+    `source` is as `arranged` returns it.
+    """
+    nothing, asked = (0, 0, 1), unit or "auto"
+    if isinstance(source, Scan):
+        return source, None, nothing
+    if isinstance(source, str | Path):
+        path = Path(source)
+        if camera is not None or not is_bop_image(path):
+            return read_scan(path, resolve_unit(asked, part.unit), camera), None, nothing
+        scan, instances = bop_scan(path, resolve_unit(asked, part.unit, "mm"))
+        inside = part.in_unit("mm")
+        alike = bop_object(path, instances, inside.diameter, inside.maximum - inside.minimum)
+        ids = (bop_scene_id(path), int(path.stem), 1 if alike is None else alike)
+        if alike is None:
+            return scan, None, ids
+        copies = [instance for instance in instances or () if instance.object_id == alike]
+        return scan, tuple(instance.T_camera_object for instance in copies), ids
+    single = np.asarray(float_array(source, "scan", (None, 3), finite=False), dtype=np.float32)
+    real = np.isfinite(single).all(axis=1) & (single != 0).any(axis=1)
+    if not real.any():
+        raise InputError(f"none of the scan's {len(single)} points was measured: all are NaN, infinite or zero")
+    return Scan(held(np.asarray(source)[real]), None, None, None, resolve_unit(asked, part.unit)), None, nothing

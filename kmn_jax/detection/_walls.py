@@ -20,7 +20,7 @@ _STRAY = 0.005  # share of the points that may lie behind a floor, measured in e
 _FLOOR_SHARE = 0.01
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Ground:
     """What is known of the plane that parts lie on, or of a layer of their tops: walls stand upright on it."""
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, check_shape
 from kmn_jax.geometry._selection import largest_in_any_order
 from kmn_jax.platforms import by_platform
 
@@ -47,8 +47,11 @@ def k_nearest(
     A query that is itself one of the points finds itself among them, unless k others are as near to float32
     (see `squared_distances`). Points where `mask` is false are never found; with fewer than k real points, the
     list ends in repeats of the nearest one, so that a maximum over neighbours stays right. On CPUs, ties go to the
-    lower index. All but masked points must be finite. Raises ValueError if k is not in [1, m].
+    lower index. All but masked points must be finite. Raises InputError if k is not in [1, m], or if queries and points
+    have not the same number of coordinates.
     """
+    check_shape(points, "points", (None, None))
+    check_shape(queries, "queries", (None, points.shape[1]))
     _check_k(k, points.shape[0])
     if queries.shape[0] == 0:
         return jnp.zeros((0, k), dtype=jnp.int32)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, check_shape
 from kmn_jax.geometry._rows import real_rows
 from kmn_jax.typing import PRNGKey, Scalar
 
@@ -25,8 +25,10 @@ def farthest_point_indices(
     then plays no part. With a key the first is drawn uniformly. Ties go to the lower index. Rows that are
     masked out or not finite are never chosen while one is real. Indices are distinct, also among coincident
     points, unless fewer than `count` are real: then the first real index fills the rest. With none real, all
-    are 0. Raises ValueError if count is not in [1, n]. Cost: `count` passes over the points.
+    are 0. Raises InputError if count is not in [1, n], or if points are no array (n, 3). Cost: `count` passes over the
+    points.
     """
+    check_shape(points, "points", (None, 3))
     total = points.shape[0]
     if not 1 <= count <= total:
         raise InputError(f"count = {count} of {total} points cannot be chosen: take a count between 1 and their number")

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from kmn_jax.errors import check_shape
 from kmn_jax.typing import Normals, Points, Pose, PRNGKey, Quaternion, Rotation, Scalar
 
 
@@ -40,12 +41,16 @@ def inverse(T_target_source: Pose) -> Pose:
 
 
 def transform_points(T_target_source: Pose, points: Points) -> Points:
-    """Rotate and translate points from the source into the target frame."""
+    """Rotate and translate points from the source into the target frame. Raises InputError for other shapes."""
+    check_shape(T_target_source, "T_target_source", (4, 4))
+    check_shape(points, "points", (None, 3))
     return rotate_vectors(T_target_source, points) + T_target_source[None, :3, 3]
 
 
 def rotate_vectors(T_target_source: Pose, vectors: Normals) -> Normals:
-    """Rotate directions, such as normals, from the source into the target frame."""
+    """Rotate directions, such as normals, from the source into the target frame. Raises InputError for other shapes."""
+    check_shape(T_target_source, "T_target_source", (4, 4))
+    check_shape(vectors, "vectors", (None, 3))
     return _product(vectors, T_target_source[:3, :3].T)
 
 

@@ -25,7 +25,7 @@ _IN_METRES = (".glb", ".step", ".stp")  # STEP files state their unit; cascadio 
 Parsed = tuple[Float64[np.ndarray, "v 3"], Float64[np.ndarray, "v 3"] | None, Int64[np.ndarray, "t 3"]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mesh:
     """Triangles as a file holds them, or a cloud if there are none. Frame and winding are the file's own."""
 

@@ -9,11 +9,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Float64
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, is_coarse
 
 FAR = 100.0  # sizes: farther away, float32 moves points by more than a hundred-thousandth of the size
 _LOST = 1e10  # sizes: farther away, float64 does
-_STEPS = 200  # across what lies far away: fewer, as float32 files have there, are not its shape any more
 _SAMPLE = 100_000  # points that tell where a scan is
 _PERCENTILES = (1, 99)  # of each axis: what lies beyond may be stray points
 
@@ -52,7 +51,7 @@ def held(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     farthest, size = float(np.abs(far_origin(low, high)).max()), float(np.linalg.norm(high - low))
     if not farthest:
         return points.astype(np.float32)
-    if size and _is_coarse(some, farthest, size):
+    if _is_coarse(some, farthest, size):
         raise InputError(
             f"its points lie {farthest:.3g} from the origin of their frame, but only {size:.3g} apart, and have not"
             " enough digits for both: export it again nearer to the origin, or in double precision"
@@ -62,5 +61,4 @@ def held(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 def _is_coarse(points: Float[np.ndarray, "n 3"], farthest: float, size: float) -> bool:
     """Tell whether points are in single precision, whatever holds them, and have few steps across their size."""
-    too_few = float(np.spacing(np.float32(farthest))) > size / _STEPS
-    return too_few and bool((points.astype(np.float32) == points).all())
+    return is_coarse(farthest, size) and bool((points.astype(np.float32) == points).all())

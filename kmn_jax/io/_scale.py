@@ -50,6 +50,7 @@ class UnitWords:
 
     scene: str = "--units {}"
     object: str = "--object-units {}"
+    steps: str | None = "depth_scale in the camera file"  # what says how far one step of a stored depth is, if it can
 
 
 _FLAGS = UnitWords()
@@ -123,9 +124,13 @@ def length_problem(diameter: float, object_unit: str, scene: SceneSize, words: U
         for which, unit, one, other in changes
         if _fault(diameter, one, other) is None
     )
+    steps = ""
+    if scene.distance is not None and words.steps is not None:
+        steps = f"; if the image's depth is stored in other steps than {scene.unit}, give {words.steps}"
     if not candidates:
         return (
-            f"{fault}, and no other unit of {', '.join(METRES)} makes them fit: check that both are what they should be"
+            f"{fault}, and no other unit of {', '.join(METRES)} makes them fit: check that both are what they should"
+            f" be{steps}"
         )
     (least, which, unit), *rest = candidates
     factor = METRES[unit] / METRES[scene.unit if which == "scene" else object_unit]
@@ -135,7 +140,7 @@ def length_problem(diameter: float, object_unit: str, scene: SceneSize, words: U
     say = f"say {words.scene.format(unit)}"
     if which == "object":
         again = f"a card is made again by kmn prepare --units {unit}, a GLB or STEP file is to be exported again"
-        say = f"say {words.object.format(unit)} ({again})"
+        say = f"say {words.object.format(unit)} ({again}){steps}"
     return f"{fault}: the {which} would fit {change}, so its lengths are probably {_NAMES[unit]}{too}: {say}"
 
 

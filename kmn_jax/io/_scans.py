@@ -24,12 +24,13 @@ from kmn_jax.units import METRES, check_unit
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
 ARRAY_SUFFIXES = (".npy", ".npz")
 _IMAGE_FORMATS = ("PNG", "TIFF")
+_TALLEST = 16  # times as high as wide: rows that are more are points, with whatever else is told of each
 _SATURATED = 65535  # of 16-bit depth, which some readers return as wider numbers: nothing was measured
 _FARTHEST = 1e9  # units: renderers write 1e10 where they see nothing
 _DENSEST = 4096  # bytes of pixels from one byte of a file: compression that does more packs no measurement
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scan:
     """What a sensor at the origin measured, in its frame (x right, y down, z forward for depth images).
 
@@ -63,6 +64,8 @@ def read_scan(path: str | Path, unit: str, camera: str | Path | None = None) -> 
     """
     path, unit = Path(path), check_unit(unit)
     suffix = path.suffix.lower()
+    if path.is_dir():
+        raise InputError(f"{path} is a folder: name a scan")
     if suffix not in (*CLOUD_SUFFIXES, *DEPTH_SUFFIXES, *ARRAY_SUFFIXES):
         known = ", ".join(dict.fromkeys((*CLOUD_SUFFIXES, *DEPTH_SUFFIXES, *ARRAY_SUFFIXES)))
         raise InputError(
@@ -128,7 +131,9 @@ def read_camera(path: str | Path) -> DepthCamera:
     except KeyError as error:
         raise InputError(f"{path} cannot be used: it has no {error}, give fx, fy, cx and cy, or cam_K") from None
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{path} cannot be used as a camera: {shown(error)}") from None
+        raise InputError(
+            f"{path} cannot be used as a camera, which is JSON with fx, fy, cx and cy, or cam_K: {shown(error)}"
+        ) from None
 
 
 def _intrinsics(matrix: np.ndarray, name: str, scale: float, size: tuple[int, int] | None) -> DepthCamera:
@@ -149,7 +154,10 @@ def _arrays(content: bytes, suffix: str) -> dict[str, np.ndarray]:
         return _npz(content)
     if suffix == ".npy":
         array = _npy(content)
-        return {"depth" if array.ndim == 2 and array.shape[1] not in (3, 6) else "points": array}
+        if not array.size:
+            raise InputError(f"it holds nothing: its shape is {array.shape}")
+        is_image = array.ndim == 2 and array.shape[1] not in (3, 6) and array.shape[0] < _TALLEST * array.shape[1]
+        return {"depth" if is_image else "points": array}
     if suffix == ".exr":
         return {"depth": parse_exr(content, min(most_elements(), _DENSEST * len(content) // 2))}
     return {"depth": _image(content)}

@@ -17,7 +17,7 @@ from kmn_jax.limits import parse_json
 from kmn_jax.units import METRES, check_unit
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Gripper:
     """A gripper in its own frame: it approaches along z, two fingers close along x, the origin is between their tips.
 
@@ -42,7 +42,7 @@ class Gripper:
         return centers - back / 2, sizes + back
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Grasp:
     """One way to hold a part."""
 

@@ -37,7 +37,7 @@ class ObjectConfig:
             raise InputError(f"random_seed = {self.random_seed} must be 0 or more")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ObjectModel:
     """A rigid object, in the frame of its file. All lengths are in `unit`.
 

@@ -30,7 +30,7 @@ _LIMIT = 1_000_000  # bytes of a card
 _ROUNDING = 1e-3  # diameters by which float32 may move a point
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Part:
     """An object to look for. Lengths are in `unit`, in the object's own frame.
 

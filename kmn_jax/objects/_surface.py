@@ -20,7 +20,7 @@ _MAX_TRIANGLES = 100_000  # meshes above it are simplified first
 _CLUSTERS = 200  # along the diagonal, when simplifying; finer ones leave too many triangles
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OuterSurface:
     """Visible triangles wound outwards, and evenly spread visible points on them. Frame and unit of the mesh."""
 

@@ -35,7 +35,7 @@ _SAME_AXIS = np.cos(np.radians(6))
 _POLYHEDRAL = ((5, np.arctan(2)), (4, np.pi / 2), (3, np.arccos(1 / 3)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Symmetries:
     """Rotational symmetries of an object, in its frame and unit; all rotations are about `center`."""
 

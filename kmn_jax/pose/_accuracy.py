@@ -8,10 +8,11 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from kmn_jax.errors import InputError, float_array, rigid_pose
+from kmn_jax.errors import InputError, float_array, is_traced, mask_array, rigid_pose
 from kmn_jax.geometry import rotation_angle_between, safe_norm
+from kmn_jax.pose._metrics import about_the_object, some_errors
 from kmn_jax.typing import ArrayInput, Pose, Scalar
 
 THRESHOLDS = tuple(round(0.05 * step, 2) for step in range(1, 11))  # of MSSD, in diameters, as BOP takes them
@@ -26,15 +27,21 @@ def symmetric_pose_error(
 
     `rotations` (s, 3, 3) are the object's discrete symmetries about `center` (3,), the identity among them; about
     `axes` (c, 3), of unit length, every turn is one. With one axis, the error is the angle between both poses' axes;
-    with several, as of a ball, it is zero.
+    with several, as of a ball, it is zero. Far from the origin, give poses in float64 (see `adi`). Raises InputError
+    for wrong shapes, poses that are not rigid and no symmetry at all.
     """
-    return _symmetric_pose_error(
-        rigid_pose(T_estimated, "T_estimated").astype(jnp.float32),
-        rigid_pose(T_true, "T_true").astype(jnp.float32),
-        float_array(rotations, "rotations", (None, 3, 3)).astype(jnp.float32),
-        float_array(axes, "axes", (None, 3)).astype(jnp.float32),
-        float_array(center, "center", (3,)).astype(jnp.float32),
-    )
+    poses = [rigid_pose(T_estimated, "T_estimated"), rigid_pose(T_true, "T_true")]
+    rotations = float_array(rotations, "rotations", (None, 3, 3), integers=True)
+    if len(rotations) == 0:
+        raise InputError("rotations is empty, but the identity is a symmetry of every object")
+    axes = float_array(axes, "axes", (None, 3), integers=True)
+    place = float_array(center, "center", (3,), integers=True)
+    if not any(map(is_traced, (*poses, place))):
+        given = (np.asarray(value, dtype=np.float64) for value in (T_estimated, T_true, center))
+        poses = [jnp.asarray(pose) for pose in about_the_object(*given)]
+        place = jnp.zeros(3)
+    arrays = (*poses, rotations, axes, place)
+    return _symmetric_pose_error(*(array.astype(jnp.float32) for array in arrays))
 
 
 @jax.jit
@@ -68,23 +75,24 @@ def _symmetric_pose_error(
 def average_recall(errors: ArrayInput) -> float:
     """Return the mean share of errors (n,), in diameters, below the thresholds from 0.05 to 0.5.
 
-    A pose that was not found counts by an infinite error. Raises InputError without a single error.
+    A pose that was not found counts by an infinite error. Raises InputError without a single error, and for NaN.
     """
-    found = np.asarray(float_array(errors, "errors", (None,), finite=False))
-    if not len(found):
-        raise InputError("errors is empty, but a share needs at least one")
+    found = np.asarray(some_errors(errors))
     return float(np.mean([(found < threshold).mean() for threshold in THRESHOLDS]))
 
 
-def match_copies(
-    errors: Float[np.ndarray, "s i"], counted: Bool[np.ndarray, " i"], threshold: float
-) -> Int[np.ndarray, " s"]:
+def match_copies(errors: ArrayInput, counted: ArrayInput, threshold: float) -> Int[np.ndarray, " s"]:
     """Return what each pose of an image is: RIGHT, WRONG, or LEFT_OUT of the count.
 
+    `errors` (s, i) are those of poses as each copy's, of which `counted` (i,) tells those that count.
     Poses come from the most probable one on; each takes the copy, of those that are free, to which its error is least
     and below the threshold. Copies that are not `counted`, as hardly anything of them is seen, are taken last; what
-    takes them is left out.
+    takes them is left out. Raises InputError for wrong shapes and NaN.
     """
+    checked = float_array(errors, "errors", (None, None), finite=False)
+    errors, counted = np.asarray(errors), np.asarray(mask_array(counted, "counted", checked.shape[1]))
+    if np.isnan(errors).any():
+        raise InputError("errors holds NaN: a pose that cannot be a copy's has an infinite error")
     states, free = np.full(len(errors), WRONG), np.ones(len(counted), dtype=bool)
     for row, own in enumerate(errors):
         for group, state in ((counted, RIGHT), (~counted, LEFT_OUT)):
@@ -96,14 +104,19 @@ def match_copies(
     return states
 
 
-def average_precision(scores: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"], num_true: int) -> float:
-    """Return the mean precision over all recalls, of detections with scores, higher ones better.
+def average_precision(scores: ArrayInput, right: ArrayInput, num_true: int) -> float:
+    """Return the mean precision over all recalls, of detections with scores (n,), higher ones better, and `right` (n,).
 
     At each recall from 0 to 1, in steps of 0.01, counts the best precision at that recall or a higher one, zero where
-    none is so high. `num_true` is how many there are to find. Raises InputError if there are none.
+    none is so high. `num_true` is how many there are to find. Raises InputError if there are none, or fewer than are
+    right, for wrong shapes and for scores that are not finite.
     """
+    right = np.asarray(mask_array(right, "right", len(float_array(scores, "scores", (None,), integers=True))))
+    scores = np.asarray(scores)
     if num_true < 1:
         raise InputError(f"num_true is {num_true}, but at least one copy is needed")
+    if right.sum() > num_true:
+        raise InputError(f"{right.sum()} detections are right, but num_true is only {num_true}: match each copy once")
     if not len(scores):
         return 0.0
     hits = np.cumsum(right[np.argsort(-scores, kind="stable")])

@@ -10,7 +10,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from kmn_jax.errors import InputError, float_array, is_traced, mask_array, positive_scalar, rigid_pose, row_count
+from kmn_jax.errors import (
+    InputError,
+    float_array,
+    is_traced,
+    mask_array,
+    point_array,
+    positive_scalar,
+    rigid_pose,
+    row_count,
+)
 from kmn_jax.geometry import (
     compose,
     from_quaternion_translation,
@@ -102,8 +111,8 @@ def icp(
     finite is INVALID_INPUT, with the identity as the pose. `score` is the share of scene points
     within the gate.
 
-    Raises InputError for wrong shapes and dtypes, values that are not finite, an initial pose that is not rigid
-    and missing normals.
+    Raises InputError for wrong shapes and dtypes, values that are not finite, points that lie too far from the origin
+    for float32, an initial pose that is not rigid and missing normals.
     """
     object_count = row_count(object_points, "object_points")
     scene_count = row_count(scene_points, "scene_points")
@@ -113,8 +122,8 @@ def icp(
     if config.method == "point_to_plane" and scene_normals is None:
         raise InputError("scene_normals is missing: point to plane needs it, or choose method='point_to_point'")
     arrays = [
-        float_array(object_points, "object_points", (None, 3), mask=object_rows),
-        float_array(scene_points, "scene_points", (None, 3), mask=scene_rows),
+        point_array(object_points, "object_points", mask=object_rows),
+        point_array(scene_points, "scene_points", mask=scene_rows),
         rigid_pose(T_scene_object, "T_scene_object"),
         positive_scalar(object_diameter, "object_diameter"),
     ]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from kmn_jax.errors import InputError, float_array, is_traced, row_count
+from kmn_jax.errors import InputError, float_array, is_traced, point_array, row_count
 from kmn_jax.geometry import dominant_eigenvector, from_rotation_translation, quaternion_to_matrix, solve_symmetric
 from kmn_jax.typing import ArrayInput, Points, Pose, Rotation
 
@@ -23,8 +23,8 @@ def kabsch(source: ArrayInput, target: ArrayInput, weights: ArrayInput | None = 
     be differentiated in forward and reverse mode; where the rotation is open, gradients are finite.
 
     Raises InputError for unequal or wrong shapes, fewer than 3 points, fewer than 3 positive weights, negative
-    weights or values that are not finite. Under a trace values cannot be checked: points or weights that are
-    not finite, and negative weights, then count as weight zero.
+    weights, values that are not finite and points that lie too far from the origin for float32. Under a trace values
+    cannot be checked: points or weights that are not finite, and negative weights, then count as weight zero.
 
     Method: B. K. P. Horn, Closed-form solution of absolute orientation using unit quaternions, 1987.
     """
@@ -37,8 +37,8 @@ def kabsch(source: ArrayInput, target: ArrayInput, weights: ArrayInput | None = 
         if (np.asarray(weights) < 0).any():
             raise InputError("weights holds negative values: give zero to points that are not to count")
         mask = weights > 0
-    source = float_array(source, "source", (None, 3), mask=mask)
-    target = float_array(target, "target", (count, 3), mask=mask)
+    source = point_array(source, "source", mask=mask)
+    target = point_array(target, "target", count, mask=mask)
     if count < 3:
         raise InputError(f"source has {count} points, but a pose needs at least 3")
     if mask is not None and int(mask.sum()) < 3:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from kmn_jax.errors import InputError, float_array, is_traced, mask_array, positive_scalar, require
+from kmn_jax.errors import InputError, float_array, is_traced, mask_array, point_array, positive_scalar, require
 from kmn_jax.geometry import largest
 from kmn_jax.typing import ArrayInput, Normals, Points, Scalar
 
@@ -83,9 +83,9 @@ def find_matches(
     arrays = (
         float_array(segmentation_logits, "segmentation_logits", (n, 2), mask=rows),
         float_array(keypoint_logits, "keypoint_logits", (n, k), mask=rows),
-        float_array(scene_points, "scene_points", (n, 3), mask=rows),
+        point_array(scene_points, "scene_points", n, mask=rows),
         float_array(scene_normals, "scene_normals", (n, 3), mask=rows),
-        float_array(keypoints, "keypoints", (k, 3)),
+        point_array(keypoints, "keypoints", k),
         float_array(keypoint_normals, "keypoint_normals", (k, 3)),
         positive_scalar(object_diameter, "object_diameter"),
     )

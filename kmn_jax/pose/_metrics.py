@@ -1,16 +1,21 @@
 """Pose errors and recall, as the field reports them. All lengths are in the unit of the points.
 
+Poses and points may lie anywhere in their frames, if they are given in float64 (NumPy's) there: outside of a trace they
+are taken relative to the object as it is truly posed before anything is computed in float32.
+
 ADD and ADI: Hinterstoisser et al. 2012; MSSD and discretised symmetries: the BOP challenge's methodology.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from kmn_jax.errors import InputError, float_array, is_traced, rigid_pose, row_count
+from kmn_jax.errors import InputError, check_digits, float_array, is_coarse, is_traced, rigid_pose, row_count
 from kmn_jax.geometry import (
     compose,
     from_quaternion_translation,
@@ -44,10 +49,9 @@ def mssd(
     `symmetries` (s, 4, 4) are motions of the object onto itself in its own frame, in the unit of the points
     (see `discretise_symmetry`); the identity always counts among them.
     """
-    poses = float_array(
-        np.zeros((0, 4, 4), np.float32) if symmetries is None else symmetries, "symmetries", (None, 4, 4)
-    )
-    return _mssd(*_checked(T_estimated, T_true, points), poses)
+    if symmetries is None:
+        symmetries = np.zeros((0, 4, 4), np.float32)
+    return _mssd(*_checked(T_estimated, T_true, points, symmetries))
 
 
 def discretise_symmetry(axis: ArrayInput, offset: ArrayInput, count: int) -> jax.Array:
@@ -56,7 +60,9 @@ def discretise_symmetry(axis: ArrayInput, offset: ArrayInput, count: int) -> jax
     The turns are equally spaced and start with the identity. They stand for a continuous symmetry, or are exactly
     a discrete one of that order.
     """
-    axis, offset = float_array(axis, "axis", (3,)), float_array(offset, "offset", (3,))
+    axis, offset = (
+        float_array(value, name, (3,), integers=True) for value, name in ((axis, "axis"), (offset, "offset"))
+    )
     if count < 1:
         raise InputError(f"count is {count}, but at least one turn is needed")
     if not is_traced(axis) and not np.any(axis):
@@ -66,7 +72,7 @@ def discretise_symmetry(axis: ArrayInput, offset: ArrayInput, count: int) -> jax
 
 def bounding_box_diagonal(points: ArrayInput) -> jax.Array:
     """Return the diagonal of the axis-aligned box around points (m, 3): the object's size as published."""
-    points = _some_points(points)
+    points = _centred(points)
     return jnp.sqrt(((points.max(axis=0) - points.min(axis=0)) ** 2).sum())
 
 
@@ -75,28 +81,93 @@ def diameter(points: ArrayInput) -> jax.Array:
 
     Time grows with the square of m: thin clouds of many thousand points first, or take their convex hull.
     """
-    return _diameter(_some_points(points))
+    return _diameter(_centred(points))
 
 
 def recall(errors: ArrayInput, size: ArrayInput, threshold: float = 0.1) -> jax.Array:
     """Return the share of errors (n,) below `threshold` times the size, one for all () or one each (n,).
 
-    A pose that was not found counts by an infinite error. Raises InputError without a single error.
+    A pose that was not found counts by an infinite error. Raises InputError without a single error, for NaN among them
+    and for sizes and thresholds that are not above zero.
     """
+    errors = some_errors(errors)
+    size = float_array(size, "size", errors.shape if np.ndim(size) else (), integers=True)
+    if not is_traced(size) and not (np.asarray(size) > 0).all():
+        raise InputError("size must be above zero")
+    if not threshold > 0:
+        raise InputError(f"threshold is {threshold}, but must be above zero")
+    return (errors < threshold * size).mean(dtype=jnp.float32)
+
+
+def some_errors(errors: ArrayInput) -> jax.Array:
+    """Return pose errors (n,), at least one, infinite ones for poses that were not found, or raise InputError."""
     count = row_count(errors, "errors")
     if count == 0:
         raise InputError("errors is empty, but a share needs at least one")
     errors = float_array(errors, "errors", (count,), finite=False)
-    size = float_array(size, "size", (count,) if np.ndim(size) else ())
-    return (errors < threshold * size).mean(dtype=jnp.float32)
+    if not is_traced(errors) and np.isnan(np.asarray(errors)).any():
+        raise InputError("errors holds NaN: a pose that was not found has an infinite error")
+    return errors
 
 
-def _checked(T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput) -> tuple[jax.Array, jax.Array, jax.Array]:
-    return (
-        rigid_pose(T_estimated, "T_estimated").astype(jnp.float32),
-        rigid_pose(T_true, "T_true").astype(jnp.float32),
-        _some_points(points),
-    )
+def about_the_object(T_estimated: np.ndarray, T_true: np.ndarray, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return two poses of an object for its frame with `centre` as the origin, in the scene's with its true place.
+
+    All is float64 of the host: what is computed of these in float32 has lost no digits, wherever the object lies.
+    """
+    place = T_true[:3, :3] @ centre + T_true[:3, 3]
+    return _moved(T_estimated, centre, place), _moved(T_true, centre, place)
+
+
+def _moved(T_b_a: np.ndarray, origin_a: np.ndarray, origin_b: np.ndarray) -> np.ndarray:
+    """Return a motion between frames with other origins."""
+    T = T_b_a.copy()
+    T[:3, 3] += T[:3, :3] @ origin_a - origin_b
+    return T
+
+
+def _checked(T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput, *motions: ArrayInput) -> list[jax.Array]:
+    """Return the arguments in float32, `motions` (s, 4, 4) of the object's frame in it among them."""
+    given = (T_estimated, T_true, points, *motions)
+    arrays = [rigid_pose(T_estimated, "T_estimated"), rigid_pose(T_true, "T_true"), _some_points(points)]
+    arrays += [float_array(some, "symmetries", (None, 4, 4), integers=True) for some in motions]
+    if not any(map(is_traced, arrays)):
+        _check_places(given)
+        estimated, true, cloud, *several = (np.asarray(value, dtype=np.float64) for value in given)
+        centre = cloud.mean(axis=0)
+        turns = [np.array([_moved(T, centre, centre) for T in some]).reshape(-1, 4, 4) for some in several]
+        arrays = [jnp.asarray(value) for value in (*about_the_object(estimated, true, centre), cloud - centre, *turns)]
+    return [array.astype(jnp.float32) for array in arrays]
+
+
+def _check_places(given: Sequence[ArrayInput]) -> None:
+    """Raise InputError if poses or points in single precision lie where it does not hold the object's shape."""
+    estimated, true, points = map(np.asarray, given[:3])
+    size = float(np.linalg.norm(np.ptp(_double(points), axis=0)))
+    for name, pose in (("T_estimated", estimated), ("T_true", true)):
+        farthest = float(np.abs(pose[:3, 3]).max())
+        if pose.dtype != np.float64 and is_coarse(farthest, size):
+            raise InputError(
+                f"{name} places an object of size {size:.3g} at a distance of {farthest:.3g}, and float32 has not"
+                " enough digits for both: give it in float64, as an array of NumPy"
+            )
+
+
+def _centred(points: ArrayInput) -> jax.Array:
+    """Return points in float32, those that are not traced about their mean, whose sizes are the same."""
+    array = _some_points(points)
+    if is_traced(array):
+        return array
+    double = _double(points)
+    return jnp.asarray(double - double.mean(axis=0)).astype(jnp.float32)
+
+
+def _double(points: ArrayInput) -> np.ndarray:
+    """Return points in float64, or raise InputError if they have lost their digits before."""
+    double = np.asarray(points, dtype=np.float64)
+    if np.asarray(points).dtype != np.float64:
+        check_digits(double, "points")
+    return double
 
 
 def _some_points(points: ArrayInput) -> jax.Array:

@@ -18,6 +18,7 @@ from starlette.exceptions import HTTPException
 from kmn_jax import __version__
 from kmn_jax.detection import Effort
 from kmn_jax.errors import InputError
+from kmn_jax.io import size_question
 from kmn_jax.objects import Part
 from kmn_jax.serve._gate import Gate
 from kmn_jax.serve._messages import DetectionResult, Health, PartInfo, PartList, Problem
@@ -295,6 +296,7 @@ def _info(name: str, part: Part) -> PartInfo:
         size=(part.maximum - part.minimum).tolist(),
         is_symmetric=part.is_symmetric,
         source_digest=part.source_digest,
+        question=size_question(part.diameter, part.unit, "units={}"),
     )
 
 
@@ -311,7 +313,10 @@ async def _bad_input(request: Request, error: Exception) -> Response:
 async def _bad_fields(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     first = error.errors()[0]
-    return _problem(422, f"{'.'.join(map(str, first['loc'][1:])) or 'the body'}: {first['msg']}")
+    name, said = ".".join(map(str, first["loc"][1:])) or "the body", first["msg"]
+    if "UploadFile" in said:
+        said = f"a text was sent in place of a file (with curl, a file is -F {name}=@FILE)"
+    return _problem(422, f"{name}: {said}")
 
 
 async def _refused(request: Request, error: Exception) -> Response:

@@ -164,6 +164,11 @@ def _request(
         raise InputError(f"the server at {server} says: {said}") from None
     except (OSError, ValueError, http.client.HTTPException) as error:
         reason = getattr(error, "reason", error)
+        if isinstance(reason, BrokenPipeError | ConnectionResetError):
+            raise InputError(
+                f"what answers at {server} hung up while {len(body or b'') / 1e6:.1f} MB were sent: they may be above"
+                " its --max-megabytes, or it is no kmn serve"
+            ) from None
         raise InputError(f"no answer from a server at {server} ({reason}): start one with kmn serve") from None
 
 

@@ -27,6 +27,7 @@ class PartInfo(_Exact):
     size: list[float] = Field(description="of the axis-aligned box around it", min_length=3, max_length=3)
     is_symmetric: bool = Field(description="whether another pose looks the same")
     source_digest: str = Field(description="SHA-256 of the file that it was made of")
+    question: str | None = Field(None, description="asked of an unlikely size: the unit may be another")
 
 
 class PartList(_Exact):

@@ -29,7 +29,7 @@ class Bin:
             raise InputError(f"bin: length, width, height and thickness are {sizes}, but must be above zero")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fixture:
     """A surface that is in a scene beside the copies, such as a container or other parts: a mesh at some poses."""
 
@@ -38,7 +38,7 @@ class Fixture:
     T_bin_fixture: Float[np.ndarray, "k 4 4"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BinScene:
     """Copies of one object at rest in a bin, seen by one camera. Frames: object, bin, camera.
 

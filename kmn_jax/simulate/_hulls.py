@@ -37,7 +37,7 @@ class HullConfig:
             raise InputError(f"hulls: thickness = {self.thickness} and gain = {self.gain} must lie between 0 and 1")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CollisionShape:
     """What physics needs to know of an object: convex parts, in the object's frame and unit, and how mass is spread.
 

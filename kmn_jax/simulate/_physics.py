@@ -66,7 +66,7 @@ class BinConfig:
             raise InputError("bin config: check_every is shorter than one step")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DropResult:
     """What became of a drop. Poses and bin are in the object's unit, and of the last attempt where none was accepted.
 
@@ -85,7 +85,7 @@ class DropResult:
     rejected: tuple[str, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Rest:
     """The end of one simulation, in simulated metres, and why it cannot be used; empty if it can."""
 
@@ -253,7 +253,7 @@ def add_planes(spec: Any, contact: dict[str, Any], size: np.ndarray) -> None:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Motion:
     """Where bodies are when a simulation ends, in simulated metres, and what it says; `fault` is empty if it went well.
 

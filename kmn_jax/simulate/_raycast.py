@@ -82,7 +82,7 @@ class RayMesh:
         return T_object_camera[:3, :3] / self.diagonal, (T_object_camera[:3, 3] - self.center) / self.diagonal
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rendering:
     """What a camera sees of a scene, in the scene's unit and the camera's frame.
 

@@ -21,7 +21,7 @@ _DROPS = 6
 _ASIDE = 0.3  # diagonals; what ended farther outside of the container is taken away
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class WorldDrop:
     """Where parts came to rest, in the unit of their shapes; `fault` says why the drop cannot be used, if so."""
 

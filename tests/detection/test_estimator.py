@@ -229,9 +229,9 @@ def test_what_cannot_be_is_one_sentence(estimator: PoseEstimator, motor: Part, s
         estimator.prepare({})
     with pytest.raises(InputError, match="must be \\(n, 3\\)"):
         estimator.prepare(np.zeros((5, 2)))
-    with pytest.raises(InputError, match="random_seed is -1, but must be between 0"):
+    with pytest.raises(InputError, match="random_seed is -1, but must be a whole number between 0"):
         estimator.detect(motor, scan, random_seed=-1)
-    with pytest.raises(InputError, match="top is 0, but must be at least 1"):
+    with pytest.raises(InputError, match="top is 0, but must be a whole number of 1 or more"):
         estimator.detect(motor, scan, top=0)
     with pytest.raises(InputError, match=r"place 2 to search at is .* mm away from the nearest measured point"):
         estimator.detect(motor, scan, at=np.stack([scan.points[0], [9000.0, 0, 0]]))

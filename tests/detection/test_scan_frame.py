@@ -111,9 +111,12 @@ def test_arrays_are_taken_for_what_they_are() -> None:
 def test_units_are_said_as_the_call_can() -> None:
     in_python = 'unit="{}" to prepare'
     assert unit_words("scan.ply", None, "auto") == UnitWords("--units {}", "--object-units {}")
-    assert unit_words("scan.ply", None, None) == unit_words(AHEAD, None, "mm") == UnitWords('unit="{}"', in_python)
-    assert unit_words(AHEAD, np.eye(3), None) == UnitWords('depth_unit="{}"', in_python)
-    assert unit_words(cloud(AHEAD), None, None) == UnitWords('unit="{}" of the Scan', in_python)
+    assert unit_words("scan.ply", None, None) == UnitWords('unit="{}"', in_python)
+    assert unit_words(AHEAD, None, "mm") == UnitWords('unit="{}"', in_python, None)
+    assert unit_words(AHEAD, np.eye(3), None) == UnitWords(
+        'depth_unit="{}"', in_python, "depth_unit in metres for one step"
+    )
+    assert unit_words(cloud(AHEAD), None, None) == UnitWords('unit="{}" of the Scan', in_python, None)
     estimator: Any = SimpleNamespace(warnings=())
     depth = np.rint(1000 * box_view().depth)
     with pytest.raises(InputError, match=r'probably millimetres: say depth_unit="mm"$'):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -85,8 +86,13 @@ def test_the_sentence_as_a_whole() -> None:
     assert length_problem(60 / 25.4, "mm", scene(MOTOR, "mm")) == (
         "the object of 2.36 mm is far too small for the scene of 500 mm: the object would fit 25.4 times larger, so its"
         " lengths are probably inches (centimetres for the object would fit, too): say --object-units in (a card is"
-        " made again by kmn prepare --units in, a GLB or STEP file is to be exported again)"
+        " made again by kmn prepare --units in, a GLB or STEP file is to be exported again); if the image's depth is"
+        " stored in other steps than mm, give depth_scale in the camera file"
     )
+    cloud = replace(scene(MOTOR, "mm"), distance=None)
+    told = length_problem(60 / 25.4, "mm", cloud)
+    assert told is not None
+    assert told.endswith("is to be exported again)")
 
 
 def test_a_more_usual_unit_is_told_where_nothing_is_found() -> None:

@@ -62,6 +62,11 @@ def test_digits_are_kept_far_away_and_batches_agree() -> None:
     assert (float(turn), float(shift)) == (pytest.approx(0, abs=1e-6), pytest.approx(0.25, rel=1e-3))
     several = jax.vmap(lambda T: symmetric_pose_error(T, *arrays[1:]))(np.stack([arrays[0], arrays[1]]))
     np.testing.assert_allclose(several[1], [shift, 0], atol=1e-6)
+    double = [there @ pose((0, -5e6, 0)) for there in (near, far)]
+    shift = symmetric_pose_error(*double, QUARTERS, NO_AXES, CENTER + np.array([0, 5e6, 0]))[1]
+    assert float(shift) == pytest.approx(0.25, rel=1e-5)
+    with pytest.raises(InputError, match="rotations is empty"):
+        symmetric_pose_error(arrays[0], arrays[1], np.zeros((0, 3, 3)), NO_AXES, CENTER)
     with pytest.raises(InputError, match="rotations has shape"):
         symmetric_pose_error(arrays[0], arrays[1], np.eye(3, dtype=np.float32), NO_AXES, CENTER)
 
@@ -71,6 +76,8 @@ def test_recall_is_the_mean_over_thresholds() -> None:
     assert average_recall([0.0, 0.22, 0.6, np.inf]) == pytest.approx((10 + 6) / 40)
     with pytest.raises(InputError, match="errors is empty"):
         average_recall(np.zeros(0))
+    with pytest.raises(InputError, match="errors holds NaN"):
+        average_recall([0.1, np.nan])
 
 
 def test_each_copy_is_matched_once_and_hidden_ones_are_left_out() -> None:
@@ -80,6 +87,10 @@ def test_each_copy_is_matched_once_and_hidden_ones_are_left_out() -> None:
     assert match_copies(errors, seen, 0.1).tolist() == [RIGHT, WRONG, RIGHT, LEFT_OUT, WRONG]
     assert match_copies(errors, seen, 0.05).tolist() == [RIGHT, WRONG, LEFT_OUT, WRONG, WRONG]
     assert match_copies(np.zeros((2, 0)), np.zeros(0, bool), 0.1).tolist() == [WRONG, WRONG]
+    with pytest.raises(InputError, match="counted has shape"):
+        match_copies(errors, seen[:2], 0.1)
+    with pytest.raises(InputError, match="errors holds NaN"):
+        match_copies([[np.nan, 0.1, 0.1]], seen, 0.1)
 
 
 def plain_precision(scores: np.ndarray, right: np.ndarray, num_true: int) -> float:
@@ -109,3 +120,9 @@ def test_average_precision_at_its_ends() -> None:
     assert average_precision(np.zeros(0), np.zeros(0, bool), 2) == 0
     with pytest.raises(InputError, match="num_true is 0"):
         average_precision(np.zeros(0), np.zeros(0, bool), 0)
+    with pytest.raises(InputError, match="2 detections are right, but num_true is only 1"):
+        average_precision([0.9, 0.8], [True, True], 1)
+    with pytest.raises(InputError, match="right has shape"):
+        average_precision([0.9, 0.8], [True], 2)
+    with pytest.raises(InputError, match="scores holds 1 values that are NaN"):
+        average_precision([0.9, np.nan], [True, True], 2)

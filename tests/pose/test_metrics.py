@@ -63,6 +63,27 @@ def test_far_from_the_origin_digits_are_kept():
         assert metric(translated(1000.125), translated(1000), points) == pytest.approx(0.125, rel=1e-3)
 
 
+def test_on_a_map_errors_are_those_near_the_origin():
+    estimated, true, points = (np.float64(value) for value in make_case(1))
+    turns = np.float64(discretise_symmetry([0, 0, 1], [1, 2, 0], 4))
+    there = pose_of((5e6, -4e7, 3e5), random_rotations(1, 3)[0])  # of sizes of some units, as from metres to a map
+    offset = np.array([-7e6, 2e6, 1e7])
+    own = pose_of(-offset)  # the object's frame is as far away
+    moved = [there @ pose @ own for pose in (estimated, true)]
+    around = np.array([pose_of(offset) @ turn @ own for turn in turns])
+    for metric, symmetries, far in ((add, (), ()), (adi, (), ()), (mssd, (turns,), (around,))):
+        expected = metric(estimated, true, points, *symmetries)
+        np.testing.assert_allclose(metric(*moved, points + offset, *far), expected, rtol=1e-4)
+        with pytest.raises(InputError, match=r"T_estimated places an object of size .* give it in float64"):
+            metric(np.float32(pose_of((1e8, 0, 0))), true, points, *symmetries)
+        with pytest.raises(InputError, match=r"points lies 1e.07 from the origin, but is only"):
+            metric(estimated, true, np.float32(points + offset), *symmetries)
+    for size in (diameter, bounding_box_diagonal):
+        np.testing.assert_allclose(size(points + offset), size(points), rtol=1e-5)
+        with pytest.raises(InputError, match=r"points lies 1e.07 from the origin"):
+            size(np.float32(points + offset))
+
+
 def test_symmetric_objects():
     generator = np.random.default_rng(0)
     quarter = generator.normal(size=(25, 3)).astype(np.float32)
@@ -99,10 +120,16 @@ def test_discretised_symmetry():
 
 
 def test_recall():
-    errors = np.float32([0.05, 0.1, 0.2, np.inf, np.nan])
-    assert recall(errors, 1.0) == pytest.approx(0.2)
+    errors = np.float32([0.05, 0.1, 0.2, np.inf, np.inf])
+    assert recall(errors, 1) == pytest.approx(0.2)
     assert recall(errors, 1.0, threshold=0.15) == pytest.approx(0.4)
     assert recall(errors, np.float32([0.1, 2, 3, 4, 5])) == pytest.approx(0.4)
+    with pytest.raises(InputError, match="errors holds NaN"):
+        recall(np.float32([0.05, np.nan]), 1.0)
+    with pytest.raises(InputError, match="size must be above zero"):
+        recall(errors, -1.0)
+    with pytest.raises(InputError, match="threshold is 0"):
+        recall(errors, 1.0, threshold=0.0)
     with pytest.raises(InputError, match="errors is empty"):
         recall(np.zeros(0), 1.0)
     with pytest.raises(InputError, match="size has shape"):

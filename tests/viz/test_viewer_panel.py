@@ -240,7 +240,7 @@ def test_a_port_in_use_is_told_before_the_search(
     def searched(_: object) -> None:
         raise AssertionError("the port was not looked at first")
 
-    monkeypatch.setattr(kmn_jax.cli, "_Session", searched)
+    monkeypatch.setattr(kmn_jax.cli, "Session", searched)
     with listen("127.0.0.1", 0) as busy:
         port = busy.getsockname()[1]
         assert kmn_jax.cli.main(["view", "--object", "a.stl", "--scene", "b.ply", "--port", str(port)]) == 2

@@ -1,0 +1,82 @@
+"""What pose functions and the estimator say of wrong arguments to callers whose calls no annotations are checked of."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import fields, is_dataclass
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import kmn_jax
+from kmn_jax.errors import InputError, check_digits, check_whole, point_array
+
+# In a process of its own: in this one, the annotations of the package are checked first, with other errors.
+CALLS = """
+import numpy as np
+import kmn_jax.detection as detection
+from kmn_jax import InputError
+from kmn_jax.geometry import farthest_point_indices, k_nearest, rotate_vectors, transform_points
+from kmn_jax.io import Scan
+from kmn_jax.pose import average_precision, match_copies, recall
+
+digest = "0" * 64
+estimator = detection.PoseEstimator(None, digest, None)
+scan = Scan(np.ones((4, 3), np.float32), None, None, None, "mm")
+points = np.ones((5, 3), np.float32)
+calls = {
+    "queries has shape": lambda: k_nearest(points, points[:, :2], 2),
+    "points has shape": lambda: transform_points(np.eye(4), points[0]),
+    "points is a list": lambda: transform_points(np.eye(4), [[0.0, 0.0, 0.0]]),
+    "vectors has shape": lambda: rotate_vectors(np.eye(4), np.ones((5, 6))),
+    "T_target_source has shape": lambda: transform_points(np.eye(3), points),
+    "points has shape (5, 2)": lambda: farthest_point_indices(points[:, :2], 2),
+    "right has dtype": lambda: average_precision([0.5], [1.0], 1),
+    "errors has shape": lambda: match_copies([0.5], [True], 0.1),
+    "threshold is 0": lambda: recall(np.ones(3), 1, 0),
+    "a str is no Part": lambda: estimator.detect("part.stl", scan),
+    "a NoneType is no Part": lambda: estimator.scene(scan, [None]),
+    "a Scan is no Part": lambda: estimator.detect(scan, scan),
+}
+for begins, call in calls.items():
+    try:
+        print("no error:", begins, call())
+    except InputError as error:
+        print("as said" if str(error).startswith(begins) else f"{begins}: {error}")
+"""
+
+
+def test_what_annotations_do_not_check_is_one_sentence() -> None:
+    done = subprocess.run([sys.executable, "-c", CALLS], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["as said"] * CALLS.count(": lambda:")
+
+
+def test_whole_numbers() -> None:
+    for good in (0, 3, np.int64(2)):
+        check_whole(good, "x", 0, 3)
+    for bad in (-1, 4, 1.0, True, "1", None):
+        with pytest.raises(InputError, match=r"x is .*, but must be a whole number between 0 and 3"):
+            check_whole(bad, "x", 0, 3)
+    with pytest.raises(InputError, match="of 1 or more"):
+        check_whole(0, "x", 1)
+
+
+def test_points_that_float32_cannot_hold_are_refused() -> None:
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    assert point_array(points + 1e4, "x").shape == (20, 3)
+    assert point_array(np.full((4, 3), 1e9), "x", 4).shape == (4, 3)  # one place has no shape to lose
+    with pytest.raises(InputError, match=r"x lies 1e\+07 from the origin, but is only .* large"):
+        point_array(points + np.array([1e7, 0, 0]), "x")
+    padded = np.concatenate([points, np.full((1, 3), 1e12)])
+    assert point_array(padded, "x", mask=jnp.arange(21) < 20).shape == (21, 3)
+    check_digits(np.zeros((0, 3)), "x")
+
+
+def test_records_of_arrays_are_compared_by_what_they_are() -> None:
+    """Comparison by value would raise for arrays; each such record is equal to itself alone, and can be hashed."""
+    records = [value for name in kmn_jax.__all__ if is_dataclass(value := getattr(kmn_jax, name))]
+    of_arrays = [one for one in records if any("Float[" in str(field.type) for field in fields(one))]
+    assert {one.__name__ for one in of_arrays} >= {"Part", "Scan", "Detection", "Detections"} & set(kmn_jax.__all__)
+    assert [one.__name__ for one in of_arrays if one.__eq__ is not object.__eq__] == []
