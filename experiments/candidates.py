@@ -104,6 +104,8 @@ def read_poses(
 
     Raises InputError if it is of other bins, weights or settings.
     """
+    if not stored.is_file():
+        raise InputError(f"{stored} does not exist: python -m experiments.calibrate --candidates makes it")
     poses = _loaded(stored)
     if str(poses.pop("made_of", "")) != _made_of(sources, fits, network) or set(poses) != {*_COLUMNS, "names", "used"}:
         raise InputError(f"{stored} holds poses of other bins, weights or settings: remove it")

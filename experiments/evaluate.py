@@ -53,7 +53,7 @@ class Options:
     """How it is carried out; every field of the config can be given too."""
 
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")]
-    output: Path | None = None  # folder; outputs/evaluation/NAME unless given
+    output: Path | None = None  # folder; one of outputs/ that is called by NAME unless given
     networks: Path | None = None  # of the method per_object: a folder with OBJECT.safetensors for each object
     overwrite: bool = False  # delete predictions of another recipe that are there
 

@@ -121,11 +121,11 @@ def view(
         host: address to serve on; 0.0.0.0 for other machines, too.
         port: port to serve on.
     """
-    check_inputs(*request.files)
     from kmn_jax.detection import table
     from kmn_jax.viz import Viewer, check_page, one_after_the_other, part_mesh
 
     check_page(host, port)
+    check_inputs(*request.files)
     session = Session(request)
     found = session.detect(session.places)
     say(table(found, session.estimator.config.accepted))

@@ -196,7 +196,8 @@ def test_units_are_those_of_the_user_s_numbers(
     (tmp_path / "small.stl").write_bytes(trimesh.creation.box((0.05, 0.02, 0.02)).export(file_type="stl"))
     assert main(["prepare", str(tmp_path / "small.stl")]) == 0
     said = capsys.readouterr().out
-    assert "note: is the object really 0.0574 mm large? If its numbers are metres, say --units m\n" in said
+    asked = "note: is the object really 0.0574 mm large? If its numbers are metres, say --units m, or make what"
+    assert f"{asked} states mm again\n" in said
 
 
 def test_bad_input_is_one_sentence_and_exit_2(

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -18,7 +22,15 @@ from jaxtyping import Array, Float
 from kmn_jax import programs
 from kmn_jax.detection import PoseEstimator, prepare_kept
 from kmn_jax.errors import InputError
-from kmn_jax.programs import KeptProgram, keep_programs, kept, kept_folder, read_kept
+from kmn_jax.programs import (
+    KeptProgram,
+    ended_by_interrupt,
+    is_nothing_kept,
+    keep_programs,
+    kept,
+    kept_folder,
+    read_kept,
+)
 
 INDUSTRIAL = Path(__file__).parents[1] / "experiments" / "assets" / "industrial"
 
@@ -268,3 +280,44 @@ def test_work_is_done_ahead_in_a_process_that_found_nothing(folder: Path) -> Non
     programs.meanwhile(work, np.zeros(5), "a")
     assert done.get(timeout=10) == 5
     assert done.empty()
+
+
+def test_it_is_known_whether_anything_is_kept(folder: Path) -> None:
+    read_kept()
+    assert is_nothing_kept()
+    counted()[0](*given(), factor=2.0)
+    next_process(folder)
+    assert not is_nothing_kept()
+    keep_programs(None)
+    assert not is_nothing_kept()  # nothing is to be kept
+
+
+def test_an_interrupt_ends_what_python_would_wait_for() -> None:
+    """The child holds a call that does not return to Python, as compiling does not."""
+    code = (
+        "import ctypes\n"
+        "from kmn_jax.programs import ended_by_interrupt\n"
+        "with ended_by_interrupt():\n"
+        "    print('waits', flush=True)\n"
+        "    ctypes.PyDLL(None).sleep(60)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "waits\n"
+        child.send_signal(signal.SIGINT)
+        assert child.wait(30) == -signal.SIGINT
+
+
+def test_interrupts_are_as_before_after_it_and_in_other_threads() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with contextlib.suppress(InputError), ended_by_interrupt():
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
+        raise InputError("no")
+    assert signal.getsignal(signal.SIGINT) is before
+
+    def elsewhere() -> object:
+        with ended_by_interrupt():
+            return signal.getsignal(signal.SIGINT)
+
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(elsewhere).result() is before

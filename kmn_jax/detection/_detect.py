@@ -51,6 +51,7 @@ _CONSIDERED = 128  # most probable poses that are compared with each other: one 
 _MOST_UNEXPLAINED = 0.5  # of the foreground: with more, it is told how to narrow it down
 _FLUSH = 0.4  # of the outline: with more of it in the plane of a larger surface, a pose may be on a wall or a table
 _MANY_FLUSH = 3  # poses: fewer need not be told
+_FEW_POINTS = 100  # of the foreground: with fewer, that nothing was found says nothing of the scan
 _SYMMETRIC = "the object is symmetric: of the poses that look the same, this is the canonical one"
 _NARROW = (
     ": on walls, rims and tables poses may be wrong though they are called probable; give the scan without parts"
@@ -159,7 +160,7 @@ def detect(
         left = unexplained(scene.foreground, scene, part, found.T_camera_object[accepted])
         share, points = left.sum() / scene.foreground.sum(), scene.placed(scene.points[left])
     doubt = None if accepted.any() else _object_doubt(part, scene)
-    reason = None if poses else "; ".join(filter(None, (_reason(found, part), scene.doubt, doubt)))
+    reason = None if poses else "; ".join(filter(None, (_reason(found, part, scene), scene.doubt, doubt)))
     if poses and doubt is not None:
         warnings = (*warnings, doubt)
     result = Detections(part.name, scene.unit, poses, clock.timing, reason, warnings)
@@ -357,8 +358,11 @@ def _object_doubt(part: Part, scene: Scene) -> str | None:
     return object_doubt(part.in_unit("mm").diameter, scene.size, scene_follows=scene.has_unit_of_part)
 
 
-def _reason(found: Candidates, part: Part) -> str:
+def _reason(found: Candidates, part: Part, scene: Scene) -> str:
     """Say why nothing is reported."""
+    points = int(scene.foreground.sum())
+    if points < _FEW_POINTS:
+        return f"only {points} points of the scan may show {part.name}, too few to tell"
     if not found.usable.any():
         places = len(np.unique(found.seed_rows))
         return f"no pose of {part.name} agrees with any of the {places} places that were searched"

@@ -141,7 +141,7 @@ def places_of(at: ArrayInput | None) -> Float[np.ndarray, "k 3"] | None:
 
 def parts_of(given: Part | Sequence[Part]) -> list[Part]:
     """Return one part or several as a list. Raises InputError for what is none, such as a file's name."""
-    parts = list(given) if isinstance(given, Sequence) and not isinstance(given, str) else [given]
+    parts = list(given) if isinstance(given, Sequence) else [given]
     for one in parts:
         if not isinstance(one, Part):
             raise InputError(

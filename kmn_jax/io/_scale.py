@@ -206,7 +206,10 @@ def size_question(diameter: float, unit: str, words: str) -> str | None:
         return None
     low, high = _USUAL_SIZES["object"]
     likely = sorted((_RARE[other], other) for other in METRES if low <= diameter * METRES[other] <= high)
-    remedy = f" If its numbers are {_NAMES[likely[0][1]]}, say {words.format(likely[0][1])}" if likely else ""
+    remedy = ""
+    if likely:
+        other = likely[0][1]
+        remedy = f" If its numbers are {_NAMES[other]}, say {words.format(other)}, or make what states {unit} again"
     return f"is the object really {_digits(diameter)} {unit} large?{remedy}"
 
 

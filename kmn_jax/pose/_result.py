@@ -14,7 +14,11 @@ from kmn_jax.errors import InputError
 
 
 class PoseStatus(IntEnum):
-    """Say how a pose search ended. Only OK means that the pose may be used."""
+    """Say how a search or a refinement ended.
+
+    After a search (`ransac`) only OK means that the pose may be used; a refinement (`icp`) returns one no worse than
+    the one it began with, whatever its status but INVALID_INPUT.
+    """
 
     OK = 0
     INVALID_INPUT = 1

@@ -280,6 +280,7 @@ def test_a_scan_without_the_part_is_an_empty_or_doubtful_result(estimator: PoseE
         motor, wavy[:30].astype(np.float32), unit="mm", background=ForegroundOptions(remove_plane="never")
     )
     assert not any(pose.probability >= 0.5 for pose in few.poses)
+    assert few.poses or few.reason == "only 30 points of the scan may show gear_motor, too few to tell"
     scene = replace(estimator.scene(wavy.astype(np.float32), motor, unit="mm"), doubt="say --units cm")
     strict = replace(estimator, config=DetectConfig(reported=0.99, accepted=0.99))
     reason = strict.detect(motor, scene, at=wavy[:2]).reason

@@ -104,8 +104,10 @@ def test_a_depth_image_shows_background_along_its_rays() -> None:
     """A pixel in front of the empty bin counts, even if its point is near to a wall beside it: the image tells both."""
     scan, _, _ = balls_on_floor()
     moved = as_scan(floor_depth(AWAY) + 100)
-    kept, _ = foreground(scan, DIAMETER, ForegroundOptions(background=moved))
+    kept, warnings = foreground(scan, DIAMETER, ForegroundOptions(background=moved))
     assert kept.all()
+    (warning,) = warnings
+    assert warning.startswith("the scan of the empty bin takes only 0.0% of the points away")
 
 
 def test_a_box_limits_what_is_looked_at() -> None:

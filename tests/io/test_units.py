@@ -230,7 +230,7 @@ def test_clouds_are_measured_alike_however_large(monkeypatch: pytest.MonkeyPatch
 
 def test_an_object_of_an_odd_size_brings_a_question() -> None:
     assert size_question(0.058, "mm", "--units {}") == (
-        "is the object really 0.058 mm large? If its numbers are metres, say --units m"
+        "is the object really 0.058 mm large? If its numbers are metres, say --units m, or make what states mm again"
     )
     assert size_question(60_000.0, "cm", "--object-units {}") == "is the object really 60000 cm large?"
     for diameter, unit in ((58.0, "mm"), (0.058, "m"), (2.0, "in"), (0.6, "mm"), (4.0, "m")):

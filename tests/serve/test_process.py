@@ -26,7 +26,7 @@ from kmn_jax.cli import main
 from kmn_jax.detection import FAST
 from kmn_jax.errors import InputError
 from kmn_jax.objects import Part
-from kmn_jax.serve import ServeConfig
+from kmn_jax.serve import ServeConfig, _client
 from kmn_jax.serve._server import _prepared, uvicorn_config
 from tests.serve.serve_sample import KnownAnswer, form, running, some_scan
 
@@ -254,3 +254,20 @@ def test_detect_sends_all_of_a_request_to_a_server(tmp_path: Path, capsys: pytes
         assert server.server.server_state.total_requests == 0
     assert main(["detect", *given, "--server", url]) == 2
     assert f"no answer from a server at {url}" in capsys.readouterr().err
+
+
+def test_a_server_that_hangs_up_while_much_is_sent_is_no_missing_one() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def hang_up() -> None:
+            connection, _ = listener.accept()
+            connection.recv(1)
+            connection.close()  # with data that was not read, which resets it
+
+        thread = threading.Thread(target=hang_up)
+        thread.start()
+        address = f"http://127.0.0.1:{listener.getsockname()[1]}"
+        message = "hung up while 30.0 MB were sent: they may be above its --max-megabytes, or it is no kmn serve"
+        with pytest.raises(InputError, match=message):
+            _client._request(address, "/detect", b"0" * 30_000_000)
+        thread.join()

@@ -36,6 +36,7 @@ def test_parts_are_prepared_listed_shown_replaced_and_deleted(server: Running) -
     info = PartInfo.model_validate(said)
     assert (info.name, info.label, info.unit) == ("motor-1.a", "gear motor", "mm")
     np.testing.assert_allclose(info.size, [1.0, 0.7, 0.4])
+    assert info.question is None
     assert server.send("PUT", "/parts/motor-1.a", file=("other.stl", b"solid"))[0] == 200
     assert server.ask("GET", "/parts/motor-1.a")[1]["label"] == "other"
     assert server.send("PUT", "/parts/a", file=b"solid")[0] == 201
@@ -190,7 +191,7 @@ def test_bad_input_is_one_sentence(server: Running, capfd: pytest.CaptureFixture
         (one | {"top": ["1", "2"]}, 422, "top is sent 2 times, but has one value"),
         (one | {"random_seed": "x"}, 422, "random_seed: Input should be a valid integer"),
         ({"object": ("a.stl", b"solid")}, 422, "scene: Field required"),
-        ({"object": ("a.stl", b"solid"), "scene": "text"}, 422, "scene: "),
+        ({"object": ("a.stl", b"solid"), "scene": "text"}, 422, "scene: a text was sent in place of a file"),
     ]
     for fields, status, sentence in cases:
         code, said, _ = server.send("POST", "/detect", **fields)
