@@ -48,7 +48,9 @@ def test_every_room_has_its_page_of_the_reference() -> None:
 
 @pytest.mark.usefixtures("like_the_root")
 @pytest.mark.parametrize(("path", "block"), EXAMPLES)
-def test_example_runs(path: Path, block: re.Match[str]) -> None:
+def test_example_runs(path: Path, block: re.Match[str], capsys: pytest.CaptureFixture[str]) -> None:
     line = path.read_text(encoding="utf-8").count("\n", 0, block.start("code"))
     code = compile("\n" * line + block["code"], str(path), "exec")
     exec(code, {"__name__": "__main__"})
+    if path.name == "grasps.md":
+        assert re.search(r"^\d\.\d\d side \d 40\.0 \[\[", capsys.readouterr().out, re.M), "some copy can be held"
