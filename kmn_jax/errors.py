@@ -7,6 +7,7 @@ inside of a trace has.
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import jax
@@ -101,9 +102,7 @@ def float_array(
     Rows where `mask` is false are padding and may hold anything; `finite` false allows infinity and NaN
     everywhere, `integers` true takes whole numbers, too. Float64 becomes the default float type.
     """
-    array = _array(value, name, shape)
-    if integers and jnp.issubdtype(array.dtype, jnp.integer):
-        array = array.astype(float)
+    array = _array(_as_fractions(value, name) if integers else value, name, shape)
     if not jnp.issubdtype(array.dtype, jnp.floating):
         raise InputError(f"{name} has dtype {array.dtype}, but must be floating point: convert it to float32")
     if finite and not is_traced(array) and not is_traced(mask) and not _is_finite(array, mask):
@@ -118,20 +117,31 @@ def float_array(
     return array
 
 
-def point_array(value: ArrayInput, name: str, count: int | None = None, *, mask: jax.Array | None = None) -> jax.Array:
-    """Return points (count, 3) as `float_array` does; too far from the origin for float32, they raise InputError."""
+def point_array(
+    value: ArrayInput, name: str, count: int | None = None, *, mask: jax.Array | None = None, size: ArrayInput = 0.0
+) -> jax.Array:
+    """Return points (count, 3) as `float_array` does; too far from the origin for float32, they raise InputError.
+
+    `size` is what they may be a small part of, or what float32 may have made one place of.
+    """
     array = float_array(value, name, (count, 3), mask=mask)
-    if not is_traced(array) and not is_traced(mask) and array.dtype != jnp.float64:
+    if not any(map(is_traced, (array, mask, size))):
         points = np.asarray(value, dtype=np.float64)
-        check_digits(points if mask is None else points[np.asarray(mask)], name)
+        check_digits(points if mask is None else points[np.asarray(mask)], name, float(size))
     return array
 
 
-def check_digits(points: np.ndarray, name: str) -> None:
-    """Raise InputError if points (n, 3) lie so far from the origin that float32 does not hold their shape."""
-    if not len(points):
-        return
-    farthest, size = float(np.abs(points).max()), float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
+def extent(points: np.ndarray) -> float:
+    """Return the diagonal of the axis-aligned box around points (n, 3) on the host, 0 of none."""
+    return float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
+
+
+def check_digits(points: np.ndarray, name: str, size: float = 0.0) -> None:
+    """Raise InputError if points (n, 3) lie so far from the origin that float32 does not hold their shape.
+
+    It is that of something of `size`, or of the points themselves if they are larger.
+    """
+    farthest, size = float(np.abs(points).max(initial=0)), max(size, extent(points))
     if is_coarse(farthest, size):
         raise InputError(
             f"{name} lies {farthest:.3g} from the origin, but is only {size:.3g} large, and float32 has not enough"
@@ -166,9 +176,9 @@ def mask_array(value: ArrayInput | None, name: str, length: int) -> jax.Array:
         with jax.ensure_compile_time_eval():
             return jnp.ones(length, dtype=bool)
     array = _array(value, name, (length,))
-    if array.dtype != jnp.bool_:
+    if array.dtype != jnp.bool_ and length:
         raise InputError(f"{name} has dtype {array.dtype}, but must be bool (true = real, false = padding)")
-    return array
+    return array if length else array.astype(bool)  # an empty list has the dtype of numbers
 
 
 def index_array(value: ArrayInput, name: str, length: int | None, upper: int) -> jax.Array:
@@ -233,6 +243,15 @@ def _fits(own: tuple[int, ...], shape: tuple[int | None, ...]) -> bool:
 
 def _shown(shape: tuple[int | None, ...]) -> str:
     return f"({', '.join('any' if want is None else str(want) for want in shape)})"
+
+
+def _as_fractions(value: ArrayInput, name: str) -> ArrayInput:
+    """Return whole numbers as fractions, those of the host in double precision."""
+    if isinstance(value, jax.Array):
+        with contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval():
+            return value.astype(float) if jnp.issubdtype(value.dtype, jnp.integer) else value
+    array = _numbers(value, name)
+    return array.astype(np.float64) if array.dtype.kind in "iu" else array
 
 
 def _numbers(value: ArrayInput, name: str) -> np.ndarray:

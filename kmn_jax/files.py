@@ -90,8 +90,12 @@ def lock(file: BinaryIO | int) -> bool:
 def check_inputs(*paths: Path | None) -> None:
     """Raise InputError if a file to read is missing: before the time is taken to read the others."""
     for path in paths:
-        if path is not None and not os.path.exists(path):
-            raise InputError(f"{path} cannot be read: No such file or directory")
+        if path is None or "\0" in str(path):  # of which the reader tells
+            continue
+        try:
+            os.stat(path)
+        except OSError as error:
+            raise InputError(f"{path} cannot be read: {error.strerror}") from None
 
 
 def check_outputs(paths: Iterable[Path | None], *read: Path | None) -> None:

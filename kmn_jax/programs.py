@@ -14,7 +14,9 @@ import inspect
 import os
 import shutil
 import signal
+import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, cached_property, update_wrapper
@@ -35,6 +37,7 @@ _Result = TypeVar("_Result")
 _MOST = 24  # programs of a folder that are kept
 _FOLDERS = 2  # of programs: of this version of the package, and of the one that was used before
 _DIGEST = 32  # bytes
+_GRACE = 1.0  # seconds that an interrupted process has to end of its own accord
 _PROCESS = 60.0  # seconds: what was used within so many was used by one process
 # Halves the time of compiling; programs are as fast, and round otherwise.
 _QUICK: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
@@ -94,25 +97,34 @@ def read_kept() -> None:
         _store.begin()
 
 
-def is_nothing_kept() -> bool:
-    """Tell, after `read_kept`, whether programs are to be kept, but none was: then everything has to be compiled."""
-    return _store is not None and not _store.read
-
-
 @contextlib.contextmanager
 def ended_by_interrupt() -> Iterator[None]:
-    """Let Ctrl+C end the process at once: Python would take notice of it when compiling has ended.
+    """Let Ctrl+C end the process within a second, also while it compiles; its exit status is then 130, too.
 
-    Nothing that is being written appears in part (see `write_whole`). In other threads than the first it does nothing.
+    Python would take notice when compiling has ended, and then wait for threads that still compile. Where interrupts
+    are ignored, as by what a script has put into the background, and in other threads than the first, it does nothing.
     """
-    if threading.current_thread() is not threading.main_thread():
+    is_first = threading.current_thread() is threading.main_thread()
+    if not is_first or signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    threading.Thread(target=_end_when_interrupted, args=(reader,), daemon=True).start()
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.set_wakeup_fd(before)
+        writer.close()  # with which the thread ends
+
+
+def _end_when_interrupted(signals: socket.socket) -> None:
+    with signals:
+        while number := signals.recv(1):
+            if number[0] == signal.SIGINT:
+                time.sleep(_GRACE)  # in which Python mostly ends it, and what is being written is finished
+                os._exit(128 + signal.SIGINT)
 
 
 def meanwhile(work: Callable[..., object], *args: Any) -> None:
@@ -153,6 +165,11 @@ class KeptProgram(Generic[_Arguments, _Result]):
         for result in results:
             with contextlib.suppress(ValueError):  # another program returns it, too
                 export.register_namedtuple_serialization(result, serialized_name=f"kmn_jax.{result.__name__}")
+
+    @property
+    def is_to_be_made(self) -> bool:
+        """Tell, after `read_kept`, whether it is to be kept, but was not: then it has to be compiled."""
+        return _store is not None and not any(name.startswith(f"{self.function.__name__}-") for name in _store.read)
 
     @cached_property
     def compiled(self) -> Callable[_Arguments, _Result]:

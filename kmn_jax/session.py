@@ -72,10 +72,18 @@ class Session:
     """An estimator with the part and the scan of a request."""
 
     def __init__(self, request: Request) -> None:
-        from kmn_jax.detection import Clock, ForegroundOptions, OrientedBox, PoseEstimator, config_of, prepare_kept
+        from kmn_jax.detection import (
+            Clock,
+            ForegroundOptions,
+            OrientedBox,
+            PoseEstimator,
+            config_of,
+            find_poses_in_crop,
+            prepare_kept,
+        )
         from kmn_jax.io import read_pose
         from kmn_jax.objects import load_grasps
-        from kmn_jax.programs import ended_by_interrupt, is_nothing_kept
+        from kmn_jax.programs import ended_by_interrupt
 
         places = [number_list(text, "--at", 3) for text in request.at]
         region: Any = None if request.roi is None else tuple(number_list(request.roi, "--roi", 6, 9))
@@ -90,7 +98,7 @@ class Session:
         self._request, self._clock = request, Clock()
         with self._clock("part"), ended_by_interrupt():
             self.estimator = PoseEstimator.from_pretrained(request.weights, config_of(request.effort))
-            if is_nothing_kept():
+            if find_poses_in_crop.is_to_be_made:
                 print(_FIRST, file=sys.stderr, flush=True)
             self.part = prepare_kept(self.estimator, request.object, unit_of(request.object_units))
         with self._clock("scene"):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -25,7 +26,6 @@ from kmn_jax.errors import InputError
 from kmn_jax.programs import (
     KeptProgram,
     ended_by_interrupt,
-    is_nothing_kept,
     keep_programs,
     kept,
     kept_folder,
@@ -282,42 +282,55 @@ def test_work_is_done_ahead_in_a_process_that_found_nothing(folder: Path) -> Non
     assert done.empty()
 
 
-def test_it_is_known_whether_anything_is_kept(folder: Path) -> None:
+def test_it_is_known_whether_a_program_is_kept(folder: Path) -> None:
     read_kept()
-    assert is_nothing_kept()
-    counted()[0](*given(), factor=2.0)
+    program, _ = counted()
+    assert program.is_to_be_made
+    program(*given(), factor=2.0)
     next_process(folder)
-    assert not is_nothing_kept()
+    assert not counted()[0].is_to_be_made
+    assert kept()(given).is_to_be_made, "another one is kept"
     keep_programs(None)
-    assert not is_nothing_kept()  # nothing is to be kept
+    assert not program.is_to_be_made, "nothing is to be kept"
 
 
-def test_an_interrupt_ends_what_python_would_wait_for() -> None:
-    """The child holds a call that does not return to Python, as compiling does not."""
+@pytest.mark.parametrize("is_busy", [True, False])
+def test_an_interrupt_ends_what_python_would_wait_for(is_busy: bool) -> None:
+    """The child is in a call that returns to Python after minutes, as compiling does, or a thread of it is."""
+    call = "long()" if is_busy else "threading.Thread(target=long).start(); time.sleep(300)"
     code = (
-        "import ctypes\n"
+        "import hashlib, sys, threading, time\n"
         "from kmn_jax.programs import ended_by_interrupt\n"
-        "with ended_by_interrupt():\n"
-        "    print('waits', flush=True)\n"
-        "    ctypes.PyDLL(None).sleep(60)\n"
+        "def long(): hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1)\n"
+        "try:\n"
+        "    with ended_by_interrupt():\n"
+        "        print('waits', flush=True)\n"
+        f"        {call}\n"
+        "except KeyboardInterrupt:\n"
+        "    sys.exit(130)\n"  # as the command does, which then waits for its threads
     )
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as child:
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, stderr=-1) as child:
         assert child.stdout is not None
         assert child.stdout.readline() == "waits\n"
         child.send_signal(signal.SIGINT)
-        assert child.wait(30) == -signal.SIGINT
+        assert child.wait(30) == 130
 
 
-def test_interrupts_are_as_before_after_it_and_in_other_threads() -> None:
-    before = signal.getsignal(signal.SIGINT)
-    with contextlib.suppress(InputError), ended_by_interrupt():
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
-        raise InputError("no")
-    assert signal.getsignal(signal.SIGINT) is before
-
-    def elsewhere() -> object:
+def test_interrupts_are_as_before_where_they_are_ignored_and_in_other_threads() -> None:
+    def watched() -> bool:
         with ended_by_interrupt():
-            return signal.getsignal(signal.SIGINT)
+            before = threading.active_count()
+            return before > outside
 
+    outside = threading.active_count()
+    assert watched()
+    while threading.active_count() > outside:  # until the thread that watched has ended
+        time.sleep(0.02)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert not watched()
+    finally:
+        signal.signal(signal.SIGINT, before)
     with ThreadPoolExecutor(1) as pool:
-        assert pool.submit(elsewhere).result() is before
+        outside += 1
+        assert not pool.submit(watched).result()

@@ -6,25 +6,34 @@ import subprocess
 import sys
 from dataclasses import fields, is_dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import kmn_jax
-from kmn_jax.errors import InputError, check_digits, check_whole, point_array
+from kmn_jax.errors import InputError, check_digits, check_whole, point_array, positive_scalar, rigid_pose
+from kmn_jax.pose import add, discretise_symmetry, icp, kabsch, recall
 
 # In a process of its own: in this one, the annotations of the package are checked first, with other errors.
 CALLS = """
+import jax
 import numpy as np
 import kmn_jax.detection as detection
 from kmn_jax import InputError
 from kmn_jax.geometry import farthest_point_indices, k_nearest, rotate_vectors, transform_points
 from kmn_jax.io import Scan
-from kmn_jax.pose import average_precision, match_copies, recall
+from kmn_jax.models import create_model
+from kmn_jax.objects import ObjectConfig, load_object, make_part
+from kmn_jax.pose import average_precision, discretise_symmetry, match_copies, recall
+from tests.reference.networks import TINY
 
-digest = "0" * 64
-estimator = detection.PoseEstimator(None, digest, None)
+digest, model = "0" * 64, create_model(TINY, jax.random.key(0))
+estimator = detection.PoseEstimator(model, digest, None)
 scan = Scan(np.ones((4, 3), np.float32), None, None, None, "mm")
+nothing = Scan(np.zeros((0, 3), np.float32), None, None, None, "mm")
+box = load_object("experiments/assets/industrial/gear_motor.stl", "mm", ObjectConfig(num_points=64))
+part = make_part(box, model, digest)
 points = np.ones((5, 3), np.float32)
 calls = {
     "queries has shape": lambda: k_nearest(points, points[:, :2], 2),
@@ -39,6 +48,13 @@ calls = {
     "a str is no Part": lambda: estimator.detect("part.stl", scan),
     "a NoneType is no Part": lambda: estimator.scene(scan, [None]),
     "a Scan is no Part": lambda: estimator.detect(scan, scan),
+    "a str is no Part ": lambda: estimator.detect("", scan),
+    "at is not an array": lambda: estimator.detect([part], scan, at=[[1, 2, 3], [1, 2]]),
+    "the scan has no points": lambda: estimator.scene(nothing, part),
+    "count is 2.5": lambda: discretise_symmetry([0, 0, 1], [0, 0, 0], 2.5),
+    "num_true is '2'": lambda: average_precision([], [], "2"),
+    "threshold is nan": lambda: match_copies([[0.5]], [True], float("nan")),
+    "threshold is not an array": lambda: recall(np.ones(3), 1, "x"),
 }
 for begins, call in calls.items():
     try:
@@ -61,6 +77,45 @@ def test_whole_numbers() -> None:
             check_whole(bad, "x", 0, 3)
     with pytest.raises(InputError, match="of 1 or more"):
         check_whole(0, "x", 1)
+
+
+def test_whole_numbers_are_as_exact_as_fractions_and_checked_in_traces() -> None:
+    large = 5_000_000_000  # more than int32 holds
+    T = np.eye(4, dtype=int)
+    T[0, 3] = large
+    assert float(rigid_pose(T, "T")[0, 3]) == float(positive_scalar(large, "d")) == large
+    assert float(discretise_symmetry([0, 0, 1], [large, 0, 0], 2)[1, 0, 3]) == pytest.approx(2 * large, rel=1e-6)
+    assert float(recall([0.4e9], large)) == 1
+    points = np.float32(np.random.default_rng(0).normal(size=(4, 3)))
+    with pytest.raises(InputError, match="T_estimated is not a rigid pose"):
+        jax.jit(lambda some: add(2 * np.eye(4, dtype=int), np.eye(4), some))(points)
+    with pytest.raises(InputError, match="size must be above zero"):
+        jax.jit(lambda errors: recall(errors, -1))(np.float32([0.1, 0.2]))
+    with pytest.raises(InputError, match="axis is zero"):
+        jax.jit(lambda: discretise_symmetry([0, 0, 0], [0, 0, 0], 2))()
+    turns = jax.jit(lambda: discretise_symmetry([0.0, 0, 1], [0, 0, 0], 2))()
+    np.testing.assert_allclose(turns[1], np.diag([-1.0, -1, 1, 1]), atol=1e-6)
+    by_thresholds = jax.vmap(lambda threshold: recall(np.float32([0.05, 0.2]), 1.0, threshold))
+    np.testing.assert_array_equal(by_thresholds(jnp.array([0.1, 0.3])), [0.5, 1])
+
+
+def test_constant_weights_are_those_of_a_trace_too() -> None:
+    points = np.float32(np.random.default_rng(0).normal(size=(5, 3)))
+    weights = np.float32([1, 1, 0, 1, 1])
+    traced = jax.jit(lambda some: kabsch(some, points, weights))(points + 1)
+    np.testing.assert_allclose(traced, kabsch(points + 1, points, weights), atol=1e-6)
+
+
+def test_clouds_that_became_one_place_are_refused_by_what_they_show() -> None:
+    points = np.float32(np.random.default_rng(0).normal(size=(30, 3)))
+    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    for far in (1e7, 1e8, 1e12):
+        place = points + np.float32(far)
+        with pytest.raises(InputError, match=r"target lies .* from the origin, but is only .* large"):
+            kabsch(points, place)
+        with pytest.raises(InputError, match=r"scene_points lies .* from the origin, but is only 9 large"):
+            icp(points, place, np.eye(4), 9, normals)
+    assert kabsch(np.full((4, 3), 7.0), np.full((4, 3), 9.0)).shape == (4, 4)  # one place each, at any size
 
 
 def test_points_that_float32_cannot_hold_are_refused() -> None:

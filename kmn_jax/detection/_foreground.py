@@ -127,10 +127,10 @@ def foreground(
         if not kept.any():
             raise InputError(f"all {before} points are those of the empty bin, or too near to it: is it really empty?")
         share = 1 - kept.sum() / before
-        if share < _HARDLY:
+        if share < _HARDLY and options.roi is None:
             warnings.append(
-                f"the scan of the empty bin takes only {share:.1%} of the points away, as it lies elsewhere: is it in"
-                " the frame and unit of this scan?"
+                f"the scan of the empty bin takes only {share:.1%} of the points away: if parts do not hide all of the"
+                " bin, it is not in the frame and unit of this scan"
             )
     wanted = options.remove_plane == "always" or (options.remove_plane == "auto" and options.background is None)
     if wanted:

@@ -68,18 +68,21 @@ def _questions(scan: Scan, sensor: Float[np.ndarray, "3"] | None) -> Iterator[st
         if off.max() > _OFF_CENTRE:
             yield (
                 f"the camera's cx, cy = {camera.cx:g}, {camera.cy:g} lie far from the middle of the image of"
-                f" {camera.width} x {camera.height} pixels: are fx, fy, cx and cy those of an image of this size?"
+                f" {camera.width} x {camera.height} pixels: are fx, fy, cx and cy those of an image of this size, and"
+                " of this piece of it if it was cut out?"
             )
         return
     offsets = scan.points - (np.zeros(3) if sensor is None else sensor)
     directions = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), np.finfo(np.float32).tiny)
-    middle = directions.mean(axis=0)
-    cosines = directions @ middle / max(float(np.linalg.norm(middle)), 1e-6)
-    half = float(np.degrees(np.arccos(np.clip(np.percentile(cosines, _STRAY), -1, 1))))
-    if half > _WIDEST / 2:
+    # From the direction that is farthest from the middle one to that which is farthest from it, but for strays.
+    order = (directions @ directions.mean(axis=0)).argsort()
+    outermost = directions[order[len(order) * _STRAY // 100]]
+    cosine = np.percentile(directions @ outermost, _STRAY)
+    angle = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    if angle > _WIDEST:
         where = "the origin, where the sensor is taken to have been" if sensor is None else "the sensor's place"
         yield (
-            f"as seen from {where}, the points fill an angle of {2 * half:.0f} degrees, more than sensors see: say"
+            f"as seen from {where}, the points fill an angle of {angle:.0f} degrees, more than sensors see: say"
             " where in the frame of the points it was (--sensor, in Python sensor=)"
         )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from kmn_jax.bop import bop_object, bop_scan, bop_scene_id, is_bop_image
-from kmn_jax.errors import InputError, float_array
+from kmn_jax.errors import InputError, float_array, row_count
 from kmn_jax.io import (
     CameraMatrix,
     Scan,
@@ -134,14 +134,15 @@ def places_of(at: ArrayInput | None) -> Float[np.ndarray, "k 3"] | None:
     """Return places to search at, one (3,) or several (k, 3), as rows in double precision."""
     if at is None:
         return None
-    rows = np.atleast_2d(at)
+    row_count(at, "at")
+    rows = np.atleast_2d(np.asarray(at))
     float_array(rows, "at", (None, 3), integers=True)
     return rows.astype(np.float64)
 
 
-def parts_of(given: Part | Sequence[Part]) -> list[Part]:
+def parts_of(given: Any) -> list[Part]:
     """Return one part or several as a list. Raises InputError for what is none, such as a file's name."""
-    parts = list(given) if isinstance(given, Sequence) else [given]
+    parts = list(given) if isinstance(given, Iterable) and not isinstance(given, str) else [given]
     for one in parts:
         if not isinstance(one, Part):
             raise InputError(
@@ -159,6 +160,8 @@ def read_source(
     """
     nothing, asked = (0, 0, 1), unit or "auto"
     if isinstance(source, Scan):
+        if not len(source.points):
+            raise InputError("the scan has no points")
         return source, None, nothing
     if isinstance(source, str | Path):
         path = Path(source)

@@ -24,7 +24,7 @@ from kmn_jax.units import METRES, check_unit
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
 ARRAY_SUFFIXES = (".npy", ".npz")
 _IMAGE_FORMATS = ("PNG", "TIFF")
-_TALLEST = 16  # times as high as wide: rows that are more are points, with whatever else is told of each
+_NARROWEST = 16  # columns of a depth image: of fewer, each row is a point, with whatever else is told of it
 _SATURATED = 65535  # of 16-bit depth, which some readers return as wider numbers: nothing was measured
 _FARTHEST = 1e9  # units: renderers write 1e10 where they see nothing
 _DENSEST = 4096  # bytes of pixels from one byte of a file: compression that does more packs no measurement
@@ -73,7 +73,7 @@ def read_scan(path: str | Path, unit: str, camera: str | Path | None = None) -> 
         )
     content = read_file(path, "a scan")
     try:
-        arrays = _arrays(content, suffix)
+        arrays = _arrays(content, suffix, camera is not None)
         if "depth" in arrays and (camera is not None or "K" in arrays or "points" not in arrays):
             if camera is not None:
                 intrinsics = read_camera(camera)
@@ -145,8 +145,11 @@ def _intrinsics(matrix: np.ndarray, name: str, scale: float, size: tuple[int, in
     return DepthCamera(fx, fy, cx, cy, scale, size)
 
 
-def _arrays(content: bytes, suffix: str) -> dict[str, np.ndarray]:
-    """Return what a file holds by name: points, perhaps with normals, or depth, perhaps with K."""
+def _arrays(content: bytes, suffix: str, has_camera: bool) -> dict[str, np.ndarray]:
+    """Return what a file holds by name: points, perhaps with normals, or depth, perhaps with K.
+
+    Rows of NPY files are those of a depth image if a camera is named for it, or if they are long.
+    """
     if suffix in CLOUD_SUFFIXES:
         points, normals, _ = parse_mesh(content, suffix)
         return {"points": points} if normals is None else {"points": points, "normals": normals}
@@ -156,7 +159,7 @@ def _arrays(content: bytes, suffix: str) -> dict[str, np.ndarray]:
         array = _npy(content)
         if not array.size:
             raise InputError(f"it holds nothing: its shape is {array.shape}")
-        is_image = array.ndim == 2 and array.shape[1] not in (3, 6) and array.shape[0] < _TALLEST * array.shape[1]
+        is_image = array.ndim == 2 and array.shape[1] not in (3, 6) and (has_camera or array.shape[1] >= _NARROWEST)
         return {"depth" if is_image else "points": array}
     if suffix == ".exr":
         return {"depth": parse_exr(content, min(most_elements(), _DENSEST * len(content) // 2))}

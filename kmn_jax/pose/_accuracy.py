@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from kmn_jax.errors import InputError, float_array, is_traced, mask_array, rigid_pose
+from kmn_jax.errors import InputError, check_whole, float_array, is_traced, mask_array, rigid_pose
 from kmn_jax.geometry import rotation_angle_between, safe_norm
 from kmn_jax.pose._metrics import about_the_object, some_errors
 from kmn_jax.typing import ArrayInput, Pose, Scalar
@@ -89,10 +89,13 @@ def match_copies(errors: ArrayInput, counted: ArrayInput, threshold: float) -> I
     and below the threshold. Copies that are not `counted`, as hardly anything of them is seen, are taken last; what
     takes them is left out. Raises InputError for wrong shapes and NaN.
     """
-    checked = float_array(errors, "errors", (None, None), finite=False)
-    errors, counted = np.asarray(errors), np.asarray(mask_array(counted, "counted", checked.shape[1]))
+    copies = float_array(errors, "errors", (None, None), finite=False).shape[1]
+    errors = np.asarray(errors)
+    counted = np.asarray(mask_array(counted, "counted", copies))
     if np.isnan(errors).any():
         raise InputError("errors holds NaN: a pose that cannot be a copy's has an infinite error")
+    if not threshold > 0:
+        raise InputError(f"threshold is {threshold}, but must be above zero")
     states, free = np.full(len(errors), WRONG), np.ones(len(counted), dtype=bool)
     for row, own in enumerate(errors):
         for group, state in ((counted, RIGHT), (~counted, LEFT_OUT)):
@@ -111,10 +114,10 @@ def average_precision(scores: ArrayInput, right: ArrayInput, num_true: int) -> f
     none is so high. `num_true` is how many there are to find. Raises InputError if there are none, or fewer than are
     right, for wrong shapes and for scores that are not finite.
     """
-    right = np.asarray(mask_array(right, "right", len(float_array(scores, "scores", (None,), integers=True))))
-    scores = np.asarray(scores)
-    if num_true < 1:
-        raise InputError(f"num_true is {num_true}, but at least one copy is needed")
+    count = len(float_array(scores, "scores", (None,), integers=True))
+    scores = np.asarray(scores, dtype=np.float64)
+    right = np.asarray(mask_array(right, "right", count))
+    check_whole(num_true, "num_true", 1)
     if right.sum() > num_true:
         raise InputError(f"{right.sum()} detections are right, but num_true is only {num_true}: match each copy once")
     if not len(scores):

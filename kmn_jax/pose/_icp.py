@@ -121,11 +121,12 @@ def icp(
     object_rows, scene_rows = (None if is_traced(m) else m for m in (object_mask, scene_mask))
     if config.method == "point_to_plane" and scene_normals is None:
         raise InputError("scene_normals is missing: point to plane needs it, or choose method='point_to_point'")
+    diameter = positive_scalar(object_diameter, "object_diameter")
     arrays = [
-        point_array(object_points, "object_points", mask=object_rows),
-        point_array(scene_points, "scene_points", mask=scene_rows),
+        point_array(object_points, "object_points", mask=object_rows, size=diameter),
+        point_array(scene_points, "scene_points", mask=scene_rows, size=diameter),
         rigid_pose(T_scene_object, "T_scene_object"),
-        positive_scalar(object_diameter, "object_diameter"),
+        diameter,
     ]
     if object_count == 0 or scene_count == 0:
         raise InputError(f"{object_count} object points and {scene_count} scene points given: both must be some")

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from kmn_jax.errors import InputError, float_array, is_traced, point_array, row_count
+from kmn_jax.errors import InputError, check_digits, extent, float_array, is_traced, mask_array, row_count
 from kmn_jax.geometry import dominant_eigenvector, from_rotation_translation, quaternion_to_matrix, solve_symmetric
 from kmn_jax.typing import ArrayInput, Points, Pose, Rotation
 
@@ -32,19 +32,23 @@ def kabsch(source: ArrayInput, target: ArrayInput, weights: ArrayInput | None = 
     if weights is None:
         weights = jnp.ones(count, dtype=jnp.float32)
     weights = float_array(weights, "weights", (count,))
-    mask = None
+    mask, used = None, None
     if not is_traced(weights):
         if (np.asarray(weights) < 0).any():
             raise InputError("weights holds negative values: give zero to points that are not to count")
-        mask = weights > 0
-    source = point_array(source, "source", mask=mask)
-    target = point_array(target, "target", count, mask=mask)
+        used = np.asarray(weights) > 0
+        mask = mask_array(used, "weights", count)
+    arrays = [float_array(source, "source", (None, 3), mask=mask), float_array(target, "target", (count, 3), mask=mask)]
     if count < 3:
         raise InputError(f"source has {count} points, but a pose needs at least 3")
-    if mask is not None and int(mask.sum()) < 3:
-        raise InputError(f"weights are positive for {int(mask.sum())} points only, but a pose needs at least 3")
-    dtype = jnp.float64 if jnp.float64 in (source.dtype, target.dtype, weights.dtype) else jnp.float32
-    return _fit_rigid(source.astype(dtype), target.astype(dtype), weights.astype(dtype))
+    if used is not None and used.sum() < 3:
+        raise InputError(f"weights are positive for {used.sum()} points only, but a pose needs at least 3")
+    dtype = jnp.float64 if jnp.float64 in (*(array.dtype for array in arrays), weights.dtype) else jnp.float32
+    if used is not None and dtype != jnp.float64 and not any(map(is_traced, arrays)):
+        clouds = [np.asarray(points, dtype=np.float64)[used] for points in (source, target)]
+        for points, name in zip(clouds, ("source", "target"), strict=True):
+            check_digits(points, name, max(map(extent, clouds)))
+    return _fit_rigid(*(array.astype(dtype) for array in (*arrays, weights)))
 
 
 def fit_rigid(source: Points, target: Points, weights: Float[Array, " n"]) -> Pose:

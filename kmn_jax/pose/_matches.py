@@ -80,14 +80,15 @@ def find_matches(
         raise InputError(f"keypoint_logits has shape {(n, k)}, but must be (points, keypoints), both at least 1")
     real = mask_array(mask, "mask", n)
     rows = None if is_traced(real) else real
+    diameter = positive_scalar(object_diameter, "object_diameter")
     arrays = (
         float_array(segmentation_logits, "segmentation_logits", (n, 2), mask=rows),
         float_array(keypoint_logits, "keypoint_logits", (n, k), mask=rows),
-        point_array(scene_points, "scene_points", n, mask=rows),
+        point_array(scene_points, "scene_points", n, mask=rows, size=diameter),
         float_array(scene_normals, "scene_normals", (n, 3), mask=rows),
-        point_array(keypoints, "keypoints", k),
+        point_array(keypoints, "keypoints", k, size=diameter),
         float_array(keypoint_normals, "keypoint_normals", (k, 3)),
-        positive_scalar(object_diameter, "object_diameter"),
+        diameter,
     )
     return _find_matches(*(array.astype(jnp.float32) for array in arrays), real, config)
 

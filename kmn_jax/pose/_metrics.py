@@ -15,7 +15,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from kmn_jax.errors import InputError, check_digits, float_array, is_coarse, is_traced, rigid_pose, row_count
+from kmn_jax.errors import (
+    InputError,
+    check_digits,
+    check_whole,
+    extent,
+    float_array,
+    is_coarse,
+    is_traced,
+    positive_scalar,
+    rigid_pose,
+    row_count,
+)
 from kmn_jax.geometry import (
     compose,
     from_quaternion_translation,
@@ -60,12 +71,10 @@ def discretise_symmetry(axis: ArrayInput, offset: ArrayInput, count: int) -> jax
     The turns are equally spaced and start with the identity. They stand for a continuous symmetry, or are exactly
     a discrete one of that order.
     """
-    axis, offset = (
-        float_array(value, name, (3,), integers=True) for value, name in ((axis, "axis"), (offset, "offset"))
-    )
-    if count < 1:
-        raise InputError(f"count is {count}, but at least one turn is needed")
-    if not is_traced(axis) and not np.any(axis):
+    axis = float_array(axis, "axis", (3,), integers=True)
+    offset = float_array(offset, "offset", (3,), integers=True)
+    check_whole(count, "count", 1)
+    if not is_traced(axis) and not np.asarray(axis).any():
         raise InputError("axis is zero, but must have a direction")
     return _turns(axis, offset, count)
 
@@ -84,7 +93,7 @@ def diameter(points: ArrayInput) -> jax.Array:
     return _diameter(_centred(points))
 
 
-def recall(errors: ArrayInput, size: ArrayInput, threshold: float = 0.1) -> jax.Array:
+def recall(errors: ArrayInput, size: ArrayInput, threshold: ArrayInput = 0.1) -> jax.Array:
     """Return the share of errors (n,) below `threshold` times the size, one for all () or one each (n,).
 
     A pose that was not found counts by an infinite error. Raises InputError without a single error, for NaN among them
@@ -94,9 +103,7 @@ def recall(errors: ArrayInput, size: ArrayInput, threshold: float = 0.1) -> jax.
     size = float_array(size, "size", errors.shape if np.ndim(size) else (), integers=True)
     if not is_traced(size) and not (np.asarray(size) > 0).all():
         raise InputError("size must be above zero")
-    if not threshold > 0:
-        raise InputError(f"threshold is {threshold}, but must be above zero")
-    return (errors < threshold * size).mean(dtype=jnp.float32)
+    return (errors < positive_scalar(threshold, "threshold") * size).mean(dtype=jnp.float32)
 
 
 def some_errors(errors: ArrayInput) -> jax.Array:
@@ -143,10 +150,10 @@ def _checked(T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput, *m
 def _check_places(given: Sequence[ArrayInput]) -> None:
     """Raise InputError if poses or points in single precision lie where it does not hold the object's shape."""
     estimated, true, points = map(np.asarray, given[:3])
-    size = float(np.linalg.norm(np.ptp(_double(points), axis=0)))
+    size = extent(_double(points))
     for name, pose in (("T_estimated", estimated), ("T_true", true)):
         farthest = float(np.abs(pose[:3, 3]).max())
-        if pose.dtype != np.float64 and is_coarse(farthest, size):
+        if _is_single(pose) and is_coarse(farthest, size):
             raise InputError(
                 f"{name} places an object of size {size:.3g} at a distance of {farthest:.3g}, and float32 has not"
                 " enough digits for both: give it in float64, as an array of NumPy"
@@ -165,9 +172,14 @@ def _centred(points: ArrayInput) -> jax.Array:
 def _double(points: ArrayInput) -> np.ndarray:
     """Return points in float64, or raise InputError if they have lost their digits before."""
     double = np.asarray(points, dtype=np.float64)
-    if np.asarray(points).dtype != np.float64:
+    if _is_single(np.asarray(points)):
         check_digits(double, "points")
     return double
+
+
+def _is_single(array: np.ndarray) -> bool:
+    """Tell whether an array may have been rounded to single precision, or less, before it came here."""
+    return array.dtype != np.float64 and array.dtype.kind not in "iu"
 
 
 def _some_points(points: ArrayInput) -> jax.Array:

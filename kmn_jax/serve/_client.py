@@ -164,9 +164,10 @@ def _request(
         raise InputError(f"the server at {server} says: {said}") from None
     except (OSError, ValueError, http.client.HTTPException) as error:
         reason = getattr(error, "reason", error)
-        if isinstance(reason, BrokenPipeError | ConnectionResetError):
+        is_sending = isinstance(error, urllib.error.URLError)  # what comes later is no such error
+        if is_sending and body and isinstance(reason, BrokenPipeError | ConnectionResetError):
             raise InputError(
-                f"what answers at {server} hung up while {len(body or b'') / 1e6:.1f} MB were sent: they may be above"
+                f"what answers at {server} hung up while {len(body) / 1e6:.1f} MB were sent: they may be above"
                 " its --max-megabytes, or it is no kmn serve"
             ) from None
         raise InputError(f"no answer from a server at {server} ({reason}): start one with kmn serve") from None

@@ -107,7 +107,7 @@ def test_a_depth_image_shows_background_along_its_rays() -> None:
     kept, warnings = foreground(scan, DIAMETER, ForegroundOptions(background=moved))
     assert kept.all()
     (warning,) = warnings
-    assert warning.startswith("the scan of the empty bin takes only 0.0% of the points away")
+    assert warning.startswith("the scan of the empty bin takes only 0.0% of the points away: if parts do not hide")
 
 
 def test_a_box_limits_what_is_looked_at() -> None:

@@ -74,7 +74,7 @@ def test_a_depth_image_has_its_frame() -> None:
 def test_a_sensor_among_the_points_is_asked_about() -> None:
     around = AHEAD * 4 - np.float32([0, 0, 9])  # as clouds that lie about an origin of their own
     (asked,) = scan_frame(cloud(around), None, None).warnings
-    assert re.match(r"as seen from the origin, where .* fill an angle of 2\d\d degrees, .*--sensor, in Python", asked)
+    assert re.match(r"as seen from the origin, where .* fill an angle of 1\d\d degrees, .*--sensor, in Python", asked)
     (asked,) = scan_frame(cloud(around), np.zeros(3), None).warnings
     assert asked.startswith("as seen from the sensor's place, the points fill an angle of ")
     assert scan_frame(cloud(around), np.array([0.0, 0, -9]), None).warnings == ()
@@ -86,7 +86,7 @@ def test_a_camera_of_another_image_size_is_asked_about() -> None:
         camera = Camera(600.0, 600.0, width / 2, height / 2, 640, 480)
         warnings = scan_frame(Scan(AHEAD, None, depth, camera, "m"), None, None).warnings
         assert len(warnings) == (0 if is_own else 1), (width, height)
-        assert all("640 x 480 pixels: are fx, fy, cx and cy those of an image of this size?" in one for one in warnings)
+        assert all("640 x 480 pixels: are fx, fy, cx and cy those of an image of this size" in one for one in warnings)
 
 
 def test_poses_in_the_robot_s_frame() -> None:

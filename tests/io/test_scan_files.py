@@ -148,7 +148,12 @@ def test_wrong_arrays_are_refused(tmp_path: Path) -> None:
     refused(np.zeros((4, 5, 2)), "its points have shape")
     refused(np.zeros((4, 5)), "none of its 4 x 5 pixels was measured")
     refused(np.zeros((0, 3)), r"it holds nothing: its shape is \(0, 3\)")
-    refused(np.ones((500, 4)), r"its points have shape \(500, 4\)")
+    np.save(path, np.ones((50, 4)))
+    with pytest.raises(InputError, match=r"its points have shape \(50, 4\)"):
+        read_scan(path, "mm")
+    np.save(path, np.ones((20_000, 16)))
+    with pytest.raises(InputError, match="it is a depth image, which needs a camera file"):
+        read_scan(path, "mm")
     with path.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": (2**70, 0, 3)})
     with pytest.raises(InputError, match="it is damaged, its shape is"):
