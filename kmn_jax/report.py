@@ -43,7 +43,7 @@ def environment() -> dict[str, Any]:
 
 def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     """Print rows as a Markdown table; the first one names the columns."""
-    print(f"\n### {title}\n\n{markdown_table(rows) if rows else '(nothing ran)'}", flush=True)
+    print(f"\n### {title}\n\n{markdown_table(rows) if rows else '(none)'}", flush=True)
 
 
 def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
