@@ -20,7 +20,7 @@ CALLS = """
 import jax
 import numpy as np
 import kmn_jax.detection as detection
-from kmn_jax import InputError
+from kmn_jax import ForegroundOptions, InputError
 from kmn_jax.geometry import farthest_point_indices, k_nearest, rotate_vectors, transform_points
 from kmn_jax.io import Scan
 from kmn_jax.models import create_model
@@ -51,6 +51,8 @@ calls = {
     "a str is no Part ": lambda: estimator.detect("", scan),
     "at is not an array": lambda: estimator.detect([part], scan, at=[[1, 2, 3], [1, 2]]),
     "the scan has no points": lambda: estimator.scene(nothing, part),
+    "background is a str": lambda: estimator.scene(scan, part, background=ForegroundOptions("empty.ply")),
+    "background is a Scan": lambda: estimator.scene(scan, part, background=scan),
     "count is 2.5": lambda: discretise_symmetry([0, 0, 1], [0, 0, 0], 2.5),
     "num_true is '2'": lambda: average_precision([], [], "2"),
     "threshold is nan": lambda: match_copies([[0.5]], [True], float("nan")),

@@ -132,6 +132,11 @@ class PoseEstimator:
         if not parts:
             raise InputError("no object is given to make the scene for")
         smallest, ratio = parts[0], parts[-1].in_unit("m").diameter / parts[0].in_unit("m").diameter
+        options = ForegroundOptions() if background is None else background
+        if not isinstance(options, ForegroundOptions):
+            raise InputError(
+                f"background is a {type(options).__name__}, but must be ForegroundOptions: an empty bin is theirs"
+            )
         if sensor is not None:
             float_array(sensor, "sensor", (3,), integers=True)
             sensor = np.asarray(sensor, dtype=np.float64)
@@ -145,11 +150,6 @@ class PoseEstimator:
             raise InputError(problem)
         is_stated = camera is None and isinstance(scan, str | Path) and is_bop_image(scan)
         question = size_question(smallest.diameter, smallest.unit, words.object)
-        options = ForegroundOptions() if background is None else background
-        if not isinstance(options, ForegroundOptions):
-            raise InputError(
-                f"background is a {type(options).__name__}, but must be ForegroundOptions: an empty bin is theirs"
-            )
         # Margins are those of the smallest part, but a plane is background only if it is no part's.
         options = replace(options, least_extent=options.least_extent * ratio)
         diameter = smallest.in_unit(read.unit).diameter

@@ -77,6 +77,10 @@ class ForegroundOptions:
     random_seed: int = 0
 
     def __post_init__(self) -> None:
+        if self.background is not None and not isinstance(self.background, Scan):
+            raise InputError(
+                f"background is a {type(self.background).__name__}, but must be a Scan, as PoseEstimator.read makes it"
+            )
         if self.remove_plane not in get_args(RemovePlane):
             raise InputError(f"remove_plane is {self.remove_plane!r}, but must be auto, always or never")
         if isinstance(self.roi, tuple):

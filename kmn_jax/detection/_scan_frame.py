@@ -24,6 +24,7 @@ _OPENGL = (
 _OFF_CENTRE = 0.15  # of an image's width or height: so far from its middle, no lens is mounted
 _WIDEST = 130.0  # degrees that the widest depth cameras see, along the diagonal
 _STRAY = 1  # per cent of the points
+_SAMPLE = 20_000  # points that tell how wide a scan is
 
 
 class ScanFrame(NamedTuple):
@@ -72,7 +73,8 @@ def _questions(scan: Scan, sensor: Float[np.ndarray, "3"] | None) -> Iterator[st
                 " of this piece of it if it was cut out?"
             )
         return
-    offsets = scan.points - (np.zeros(3) if sensor is None else sensor)
+    some = scan.points[:: 1 + len(scan.points) // _SAMPLE]
+    offsets = some - (np.zeros(3) if sensor is None else sensor)
     directions = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), np.finfo(np.float32).tiny)
     # From the direction that is farthest from the middle one to that which is farthest from it, but for strays.
     order = (directions @ directions.mean(axis=0)).argsort()
