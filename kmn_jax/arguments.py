@@ -7,22 +7,21 @@ import io
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import is_dataclass
 from functools import partial, wraps
-from typing import Any
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import tyro
 
 from kmn_jax.errors import InputError
 
-_VECTORS = ("--at", "--sensor", "--roi")  # flags whose values may begin with a minus sign
-_SEVERAL = ("--at", "--allow-host")  # flags that may be given several times
-
 
 def joined(arguments: list[str]) -> list[str]:
-    """Return arguments in which a value that begins with a minus sign is joined to its flag."""
+    """Return arguments in which numbers with commas between them are joined to their flag, as they may be negative."""
     result: list[str] = []
     for argument in arguments:
-        if result and result[-1] in _VECTORS and argument.startswith("-") and "," in argument:
+        is_flag = bool(result) and result[-1].startswith("--") and "=" not in result[-1]
+        if is_flag and argument.startswith("-") and "," in argument:
             result[-1] += f"={argument}"
         else:
             result.append(argument)
@@ -34,9 +33,10 @@ def parsed(arguments: list[str], calls: Iterable[Callable[..., None]]) -> Callab
 
     Raises InputError, in one sentence, for wrong ones.
     """
-
-    flags = [argument.partition("=")[0] for argument in arguments if argument.startswith("--")]
-    repeated = next((flag for flag in flags if flags.count(flag) > 1 and flag not in _SEVERAL), None)
+    calls = tuple(calls)
+    flags = [argument.partition("=")[0].replace("_", "-") for argument in arguments if argument.startswith("--")]
+    several = {flag for call in calls for flag in _repeatable(call)}
+    repeated = next((flag for flag in flags if flags.count(flag) > 1 and flag not in several), None)
     if repeated is not None:
         raise InputError(f"{repeated} is given {flags.count(repeated)} times, but has one value: see kmn --help")
 
@@ -53,6 +53,16 @@ def parsed(arguments: list[str], calls: Iterable[Callable[..., None]]) -> Callab
         if not error.code:  # of --help
             raise
     raise InputError(_sentence(said.getvalue()))
+
+
+def _repeatable(call: Any) -> Iterator[str]:
+    """Yield the flags of a command, or of a dataclass among its arguments, that may be given several times."""
+    for name, hint in get_type_hints(call, include_extras=True).items():
+        kind, *notes = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+        if is_dataclass(kind):
+            yield from _repeatable(kind)
+        elif tyro.conf.UseAppendAction in notes:
+            yield f"--{name.replace('_', '-')}"
 
 
 @contextlib.contextmanager

@@ -69,6 +69,7 @@ UNITS = "{auto,mm,cm,m,in}"
         ),
         ("prepare", "Missing from kmn prepare: PATH"),
         ("detect --object a --scene b --object=c", "--object is given 2 times, but has one value"),
+        ("detect --object a --scene b --random-seed 1 --random_seed 2", "--random-seed is given 2 times"),
         (f"prepare a {'long/' * 60}b", f"Unrecognized options: {'long/' * 60}b: see kmn"),
         ("prepare a b", "Unrecognized options: b"),
         ("detect --object a --scene b --top x", "Error parsing --top: "),
@@ -82,6 +83,18 @@ def test_wrong_arguments_are_one_sentence(arguments: str, said: str, capsys: pyt
     assert printed.err.startswith(f"kmn: {said}")
     assert printed.err.endswith("--help\n")
     assert printed.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("detect --object a --scene b --at 1,2,3 --at -1,-2,-3 --at=-4,5,6", "a cannot be read: No such file"),
+        ("serve --allow-host a --allow-host b --port 99999", "port 99999 is not one"),
+    ],
+)
+def test_some_flags_may_be_given_several_times(arguments: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments.split()) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_an_interrupt_while_libraries_load_leaves_no_traceback(tmp_path: Path) -> None:

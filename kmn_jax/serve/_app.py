@@ -5,7 +5,7 @@
 import functools
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_origin
 from urllib.parse import quote
 
 from fastapi import APIRouter, Depends, FastAPI, File, Form, Request, UploadFile
@@ -41,18 +41,16 @@ _PROBLEMS: dict[int | str, dict[str, Any]] = {
 _UNKNOWN: dict[int | str, dict[str, Any]] = {404: {"model": Problem, "description": "Not known"}}
 _PNG: dict[int | str, dict[str, Any]] = {200: {"content": {"image/png": {}}, "description": "The picture"}}
 
-_LISTS = ("at",)  # fields that may be sent several times
-
 
 async def only_known_fields(request: Request) -> None:
     """Refuse a field that a request does not have, or has once: it would be ignored without a word."""
     route, sent = request.scope["route"], [name for name, _ in (await request.form()).multi_items()]
     assert isinstance(route, APIRoute)
-    known = [field.alias for field in route.dependant.body_params]
+    known = {field.alias: field.field_info.annotation for field in route.dependant.body_params}
     for name in sent:
         if name not in known:
             raise HTTPException(422, f"{name[:80]!r} is not known: the fields are {', '.join(known)}")
-        if sent.count(name) > 1 and name not in _LISTS:
+        if sent.count(name) > 1 and get_origin(known[name]) is not list:
             raise HTTPException(422, f"{name} is sent {sent.count(name)} times, but has one value")
 
 
