@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from kmn_jax.detection import Detections, Scene
     from kmn_jax.units import Unit
 
-_FIRST = "kmn: the first search compiles what all later ones use, which takes a minute or so"
+_FIRST = "kmn: the first search compiles what all later ones use, which takes up to a minute"
 
 Units = Literal["auto", "mm", "cm", "m", "in"]
 

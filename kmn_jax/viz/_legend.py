@@ -15,7 +15,7 @@ from kmn_jax.viz._raster import Canvas
 from kmn_jax.viz._shading import as_bytes, brightness, distinct_colors, surface_hexagons
 from kmn_jax.viz._truth import nearest_keypoint
 
-LIKELY = DetectConfig().accepted  # poses below that probability are drawn pale
+ACCEPTED = DetectConfig().accepted  # poses below that probability are drawn pale
 NOT_THE_PART = (0.30, 0.32, 0.36)  # the colour of points of crops that are on no copy
 UNEXPLAINED = (0.62, 0.40, 0.22)  # that of foreground on no pose
 _LISTED = 16  # poses
@@ -27,8 +27,8 @@ def summary(found: Detections) -> str:
     """Return a result in half a sentence."""
     if not found.poses:
         return found.reason or "no pose was found"
-    count, likely = len(found.poses), sum(pose.probability >= LIKELY for pose in found.poses)
-    return f"{count} pose{'s' if count > 1 else ''}, {likely} of them likely"
+    accepted = sum(pose.probability >= ACCEPTED for pose in found.poses)
+    return f"{accepted} found, {len(found.poses) - accepted} doubtful"
 
 
 def center_of(part: Part) -> Float[np.ndarray, "3"]:
@@ -66,7 +66,7 @@ def draw_list(axis: Any, found: Detections) -> None:
         mark = "!" if pose.warnings else " "
         line = f"{row:>3}{mark} {pose.probability:>11.2f} {pose.visible_fraction:>7.0%} {pose.num_inliers:>7}"
         axis.text(0, row, "■", fontsize=12, va="center", color=color)
-        gray = "black" if pose.probability >= LIKELY else "0.5"
+        gray = "black" if pose.probability >= ACCEPTED else "0.5"
         axis.text(0.1, row, line, fontsize=9, va="center", color=gray, family="monospace")
     notes = [*dict.fromkeys(found.warnings), *pose_notes(found)]
     if len(found.poses) > _LISTED:

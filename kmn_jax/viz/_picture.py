@@ -21,7 +21,7 @@ from kmn_jax.extras import install_command
 from kmn_jax.files import write_whole
 from kmn_jax.geometry import Camera
 from kmn_jax.objects import Part
-from kmn_jax.viz._legend import LIKELY, NOT_THE_PART, UNEXPLAINED, center_of, draw_list, draw_part, summary
+from kmn_jax.viz._legend import ACCEPTED, NOT_THE_PART, UNEXPLAINED, center_of, draw_list, draw_part, summary
 from kmn_jax.viz._raster import Canvas
 from kmn_jax.viz._shading import (
     as_bytes,
@@ -182,8 +182,8 @@ class _Panels:
         nearest = np.full(image.shape[:2], np.inf)
         ranked = enumerate(zip(self.found.poses, self.pose_colors, strict=True), start=1)
         # Likely poses come last: they are in front of all others, whatever their depth.
-        for rank, (pose, color) in sorted(ranked, key=lambda row: row[1][0].probability >= LIKELY):
-            likely = pose.probability >= LIKELY
+        for rank, (pose, color) in sorted(ranked, key=lambda row: row[1][0].probability >= ACCEPTED):
+            accepted = pose.probability >= ACCEPTED
             self._paint(pose, color, image, nearest)
             center = self._in_view(placed(pose.T_scene_object, center_of(self.part)))
             axis.annotate(
@@ -191,15 +191,15 @@ class _Panels:
                 image_places(self.canvas.camera, center),
                 ha="center",
                 va="center",
-                fontsize=10 if likely else 8.5,
-                weight="bold" if likely else "normal",
-                color="black" if likely else "0.25",
+                fontsize=10 if accepted else 8.5,
+                weight="bold" if accepted else "normal",
+                color="black" if accepted else "0.25",
                 path_effects=[effects.withStroke(linewidth=2.5, foreground="white")],
                 annotation_clip=True,
             )
         self._draw_unexplained(axis)
         axis.imshow(as_bytes(image), extent=self.canvas.extent, interpolation="nearest")
-        title = f"Poses with rank and probability; dashed below {LIKELY}"
+        title = f"Poses with rank and probability; dashed below {ACCEPTED}"
         if self.found.unexplained is not None:
             title += f"; {self.found.unexplained:.0%} on none (brown)"
         axis.set_title(title)
@@ -232,7 +232,7 @@ class _Panels:
         shown = (index >= 0) & (depth[index] < nearest)
         measured = values_at(self.view.depth, image_places(self.view.camera, centers))
         hidden = (measured > 0) & (measured < depth - _IN_FRONT * self.part.diameter)
-        if pose.probability >= LIKELY:
+        if pose.probability >= ACCEPTED:
             nearest[shown] = depth[index[shown]]
             outline = shown & ~binary_erosion(shown, iterations=2)
             opacity = np.where(hidden, 0.35, 0.85)

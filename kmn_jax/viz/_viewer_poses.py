@@ -9,7 +9,7 @@ import numpy as np
 
 from kmn_jax.detection import Detection, Detections, placed, warnings_once
 from kmn_jax.objects import Part
-from kmn_jax.viz._legend import LIKELY
+from kmn_jax.viz._legend import ACCEPTED
 from kmn_jax.viz._shading import distinct_colors
 from kmn_jax.viz._viewer_scene import PageScene, PoseNodes
 from kmn_jax.viz._viewer_text import details, facts
@@ -43,7 +43,7 @@ class PoseList:
             self._choice = self._gui.add_dropdown("Numbers of pose", ranks, hint="or click on a pose")
             self._choice.on_update(lambda _: self._show_numbers())
             self._numbers = self._gui.add_html("", visible=False)
-            several = self._gui.add_button_group("Switch on", ("all", "likely", "none"), visible=len(poses) > 1)
+            several = self._gui.add_button_group("Switch on", ("all", "found", "none"), visible=len(poses) > 1)
             several.on_click(lambda _: self._switch_several(several.value))
             _, own = warnings_once(found)
             colors = distinct_colors(len(poses))
@@ -89,7 +89,7 @@ class PoseList:
 
     def _switch_several(self, which: str) -> None:
         for switch, pose in zip(self._switches, self._found.poses, strict=True):
-            switch.value = which == "all" or (which == "likely" and pose.probability >= LIKELY)
+            switch.value = which == "all" or (which == "found" and pose.probability >= ACCEPTED)
 
     def _show_numbers(self) -> None:
         value = self._choice.value

@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 
 from kmn_jax.detection import Detection, Scene, into, placed
 from kmn_jax.objects import Part
-from kmn_jax.viz._legend import LIKELY, NOT_THE_PART, center_of
+from kmn_jax.viz._legend import ACCEPTED, NOT_THE_PART, center_of
 from kmn_jax.viz._mesh import PartMesh
 from kmn_jax.viz._shading import (
     as_bytes,
@@ -115,13 +115,13 @@ class PageScene:
             wxyz=SO3.from_matrix(T[:3, :3]).wxyz,
             position=self._on_page(T[:3, 3]),
         )
-        likely = pose.probability >= LIKELY
+        accepted = pose.probability >= ACCEPTED
         vertices, triangles = self._mesh or _hexagon_mesh(part, int(np.clip(_MOST_HEXAGONS // count, 400, 3000)))
         surface = scene.add_mesh_simple(
             f"{name}/surface",
             (vertices / self.size).astype(np.float32),
             triangles.astype(np.uint32),
-            color=tuple(int(value) for value in as_bytes(color if likely else _PALE + (1 - _PALE) * color)),
+            color=tuple(int(value) for value in as_bytes(color if accepted else _PALE + (1 - _PALE) * color)),
             position=-_SURFACE_LIFT * part.diameter / self.size * _unit(T[:3, 3]) @ T[:3, :3],
             flat_shading=self._mesh is not None,
             side="double",

@@ -66,7 +66,7 @@ def eventually(condition: Callable[[], object], seconds: float = 40.0) -> None:
 def look_at(browser: Any, page: Viewer) -> None:
     """Open the page and wait for what is in it."""
     browser.get(f"{page.url}")
-    eventually(lambda: "2 poses, 1 of them likely" in text(browser))
+    eventually(lambda: "1 found, 1 doubtful" in text(browser))
 
 
 def text(browser: Any) -> str:

@@ -54,7 +54,7 @@ def test_the_page_shows_the_poses_and_switches_them(browser: Any, sample: tuple[
 
         click(browser, "all")
         eventually(lambda: page.is_shown(1))
-        click(browser, "likely")
+        click(browser, "found")
         eventually(lambda: page.is_shown(1) and not page.is_shown(2))
 
         assert not page.is_shown(1, "Keypoints")

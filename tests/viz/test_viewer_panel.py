@@ -165,7 +165,7 @@ def test_the_next_scan_takes_the_place_of_all(browser: Any, sample: tuple[Scene,
         assert "first.png of " in text(browser)
         click(browser, "Next scan")
         eventually(lambda: "second.png of " in text(browser))
-        assert "1 pose, 1 of them likely" in text(browser)
+        assert "1 found, 0 doubtful" in text(browser)
         assert "Pose 2" not in text(browser)
         np.testing.assert_allclose(page.region.T_scene_box[:3, :3], np.eye(3), atol=1e-9)
         time.sleep(0.1)
