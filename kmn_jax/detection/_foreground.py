@@ -18,7 +18,7 @@ from kmn_jax.detection._background import away_from_empty, in_front_of_empty
 from kmn_jax.detection._frames import into, placed
 from kmn_jax.detection._planes import Plane, dominant_plane, extent
 from kmn_jax.detection._walls import Ground, off_walls
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, finite_numbers
 from kmn_jax.io import Scan
 from kmn_jax.units import METRES
 
@@ -83,9 +83,9 @@ class ForegroundOptions:
             )
         if self.remove_plane not in get_args(RemovePlane):
             raise InputError(f"remove_plane is {self.remove_plane!r}, but must be auto, always or never")
-        if isinstance(self.roi, tuple):
-            low, high = self.roi[:3], self.roi[3:]
-            if not np.isfinite(self.roi).all() or not all(a < b for a, b in zip(low, high, strict=True)):
+        if self.roi is not None and not isinstance(self.roi, OrientedBox):
+            box = finite_numbers(self.roi, "roi (xmin ymin zmin xmax ymax zmax)", 6)
+            if not (box[:3] < box[3:]).all():
                 raise InputError(
                     f"roi is {self.roi}, but must be xmin ymin zmin xmax ymax zmax, each min below its max"
                 )

@@ -95,7 +95,10 @@ def grasps_of(given: GraspSource | Sequence[GraspSource | None] | None, count: i
     """Return the grasps of each of several parts. Raises InputError if they are not as many as the parts."""
     if given is None:
         return [None] * count
-    each = [given] if isinstance(given, str | Path | Grasps) else list(given)
+    each: list[Any] = list(given) if isinstance(given, list | tuple) else [given]
+    for one in each:
+        if not isinstance(one, str | Path | Grasps | None):
+            raise InputError(f"grasps are a {type(one).__name__}, but must be a file, or what load_grasps returns")
     if len(each) != count:
         raise InputError(
             f"grasps are given for {len(each)} parts, but there are {count}: give a file, or none, for each"
@@ -122,6 +125,8 @@ def object_of(source: PartSource, unit: str | None, name: str | None, config: Ob
         if not isinstance(source, tuple) or len(source) != 2:
             raise InputError(f"an object cannot be made of a {type(source).__name__}: give a file, a cloud or a mesh")
         vertices, triangles = (np.asarray(array) for array in source)
+        if triangles.dtype.kind not in "iuf" or (triangles % 1 != 0).any():
+            raise InputError("the mesh's triangles must be rows of three whole numbers: which vertices they have")
         return object_from_mesh(name, vertices.astype(np.float64), triangles.astype(np.int64), unit, config)
     cloud = np.asarray(source)
     if cloud.ndim != 2 or cloud.shape[1] not in (3, 6):
