@@ -9,6 +9,7 @@ ADD and ADI: Hinterstoisser et al. 2012; MSSD and discretised symmetries: the BO
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -224,6 +225,7 @@ def _mssd(T_estimated: Pose, T_true: Pose, points: Points, symmetries: Float[Arr
 _diameter = jax.jit(largest_distance)
 
 
+@partial(jax.jit, static_argnums=2)
 def _turns(axis: Float[Array, "3"], offset: Float[Array, "3"], count: int) -> Float[Array, "c 4 4"]:
     half = jnp.arange(count, dtype=axis.dtype) * (jnp.pi / count)
     unit = axis / jnp.sqrt((axis**2).sum())
