@@ -184,5 +184,8 @@ def test_what_cannot_be_trained_is_refused(tmp_path: Path) -> None:
     for rate in ({"learning_rate": 0.0}, {"weight_decay": -1.0}):
         with pytest.raises(InputError, match="must"):
             fitted(*drawn(16), np.ones(16), options(tmp_path, **rate))
+    with pytest.raises(InputError, match=r"poses\.npz does not exist: python -m experiments\.calibrate --candidates"):
+        train_verifier(options(tmp_path))
+    (tmp_path / "poses.npz").write_bytes(b"damaged")
     with pytest.raises(InputError, match="holds no poses"):
         train_verifier(options(tmp_path))
