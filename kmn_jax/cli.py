@@ -42,11 +42,13 @@ def prepare(
     from kmn_jax.detection import PoseEstimator, describe
     from kmn_jax.io import size_question
     from kmn_jax.objects import CARD_SUFFIX, save_part
+    from kmn_jax.programs import ended_by_interrupt
 
     require(output is None or output.suffix == CARD_SUFFIX, f"--output {output} must end in {CARD_SUFFIX}")
     target = output or source.parent / f"{source.stem}{CARD_SUFFIX}"
     check_outputs((target,), source, Path(weights))
-    part = PoseEstimator.from_pretrained(weights).prepare(source, unit_of(units))
+    with ended_by_interrupt():
+        part = PoseEstimator.from_pretrained(weights).prepare(source, unit_of(units))
     save_part(part, target)
     say(f"{describe(part)}; wrote {target}")
     question = size_question(part.diameter, part.unit, "--units {}")
@@ -196,12 +198,14 @@ def export(
         weights: released network, or a .safetensors file.
     """
     from kmn_jax.detection import PoseEstimator, export_estimator
+    from kmn_jax.programs import ended_by_interrupt
 
     check_outputs((output,), object, Path(weights))
-    estimator = PoseEstimator.from_pretrained(weights)
-    part = estimator.prepare(object, unit_of(object_units))
-    part = part.in_unit(unit_of(units) or part.unit)
-    size = export_estimator(estimator, part, output, points)
+    with ended_by_interrupt():
+        estimator = PoseEstimator.from_pretrained(weights)
+        part = estimator.prepare(object, unit_of(object_units))
+        part = part.in_unit(unit_of(units) or part.unit)
+        size = export_estimator(estimator, part, output, points)
     say(f"wrote {output}: {size / 1e6:.1f} MB, scans of up to {points} points in {part.unit}")
 
 
