@@ -99,7 +99,7 @@ def read_kept() -> None:
 
 @contextlib.contextmanager
 def ended_by_interrupt() -> Iterator[None]:
-    """Let Ctrl+C end the process within a second, also while it compiles; its exit status is then 130, too.
+    """Let Ctrl+C end the process soon, also while it compiles; its exit status is then 130, too.
 
     Python would take notice when compiling has ended, and then wait for threads that still compile. Where interrupts
     are ignored, as by what a script has put into the background, and in other threads than the first, it does nothing.
