@@ -8,7 +8,6 @@ ADD and ADI: Hinterstoisser et al. 2012; MSSD and discretised symmetries: the BO
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -140,7 +139,7 @@ def _checked(T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput, *m
     arrays = [rigid_pose(T_estimated, "T_estimated"), rigid_pose(T_true, "T_true"), _some_points(points)]
     arrays += [float_array(some, "symmetries", (None, 4, 4), integers=True) for some in motions]
     if not any(map(is_traced, arrays)):
-        _check_places(given)
+        _check_places(T_estimated, T_true, points)
         estimated, true, cloud, *several = (np.asarray(value, dtype=np.float64) for value in given)
         centre = cloud.mean(axis=0)
         turns = [np.array([_moved(T, centre, centre) for T in some]).reshape(-1, 4, 4) for some in several]
@@ -148,11 +147,10 @@ def _checked(T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput, *m
     return [array.astype(jnp.float32) for array in arrays]
 
 
-def _check_places(given: Sequence[ArrayInput]) -> None:
+def _check_places(T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput) -> None:
     """Raise InputError if poses or points in single precision lie where it does not hold the object's shape."""
-    estimated, true, points = map(np.asarray, given[:3])
     size = extent(_double(points))
-    for name, pose in (("T_estimated", estimated), ("T_true", true)):
+    for name, pose in (("T_estimated", np.asarray(T_estimated)), ("T_true", np.asarray(T_true))):
         farthest = float(np.abs(pose[:3, 3]).max())
         if _is_single(pose) and is_coarse(farthest, size):
             raise InputError(
