@@ -40,14 +40,6 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
-def pytest_xdist_auto_num_workers() -> int | None:
-    """Return one worker more than there are cores: a tenth of the time they wait, for browsers and other processes."""
-    if "PYTEST_XDIST_AUTO_NUM_WORKERS" in os.environ:
-        return None  # as it says
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return cores + 1
-
-
 @pytest.fixture(autouse=True, scope="session")
 def trace_what_is_tested() -> Iterator[None]:
     """Let commands that are called by tests keep no traced programs: they are those of the code as it is."""

@@ -21,13 +21,12 @@ OPTIMISED = (
     "ros/test_results.py",
     "experiments/test_train_verifier.py",
 )
-# The longest first. Training comes second and third, so that on two cores one of three workers compiles the search, and
-# the others read it.
+# The longest first. Training comes second, so that with two workers one compiles the search and the other reads it.
 LONGEST = (
     OPTIMISED[0],
     "train/test_loop.py",
-    "train/test_sharding.py",
     *OPTIMISED[1:],
+    "train/test_sharding.py",
     "detection/test_crop_search.py",
     "pose/test_ransac.py",
     "models/test_keymatchnet.py",
