@@ -158,9 +158,9 @@ def check_shape(value: ArrayInput, name: str, shape: tuple[int | None, ...]) -> 
     """Raise InputError unless `value` is an array of `shape` (None = any length); nothing is asked of its values."""
     own = getattr(value, "shape", None)
     if own is None:
-        raise InputError(f"{name} is a {type(value).__name__}, but must be an array of shape {_shown(shape)}")
-    if not _fits(own, shape):
-        raise InputError(f"{name} has shape {own}, but must have shape {_shown(shape)}")
+        raise InputError(f"{name} is a {type(value).__name__}, but must be an array of shape {_shape_text(shape)}")
+    if len(own) != len(shape) or any(want not in (None, have) for want, have in zip(shape, own, strict=True)):
+        raise InputError(f"{name} has shape {own}, but must have shape {_shape_text(shape)}")
 
 
 def row_count(value: ArrayInput, name: str) -> int:
@@ -176,9 +176,11 @@ def mask_array(value: ArrayInput | None, name: str, length: int) -> jax.Array:
         with jax.ensure_compile_time_eval():
             return jnp.ones(length, dtype=bool)
     array = _array(value, name, (length,))
-    if array.dtype != jnp.bool_ and length:
+    if not length:  # an empty list has the dtype of numbers
+        return array.astype(bool)
+    if array.dtype != jnp.bool_:
         raise InputError(f"{name} has dtype {array.dtype}, but must be bool (true = real, false = padding)")
-    return array if length else array.astype(bool)  # an empty list has the dtype of numbers
+    return array
 
 
 def index_array(value: ArrayInput, name: str, length: int | None, upper: int) -> jax.Array:
@@ -237,11 +239,7 @@ def _array(value: ArrayInput, name: str, shape: tuple[int | None, ...]) -> jax.A
     return array
 
 
-def _fits(own: tuple[int, ...], shape: tuple[int | None, ...]) -> bool:
-    return len(own) == len(shape) and all(want in (None, have) for want, have in zip(shape, own, strict=True))
-
-
-def _shown(shape: tuple[int | None, ...]) -> str:
+def _shape_text(shape: tuple[int | None, ...]) -> str:
     return f"({', '.join('any' if want is None else str(want) for want in shape)})"
 
 

@@ -23,14 +23,7 @@ from jaxtyping import Array, Float
 from kmn_jax import programs
 from kmn_jax.detection import PoseEstimator, prepare_kept
 from kmn_jax.errors import InputError
-from kmn_jax.programs import (
-    KeptProgram,
-    ended_by_interrupt,
-    keep_programs,
-    kept,
-    kept_folder,
-    read_kept,
-)
+from kmn_jax.programs import KeptProgram, ended_by_interrupt, keep_programs, kept, kept_folder, read_kept
 
 INDUSTRIAL = Path(__file__).parents[1] / "experiments" / "assets" / "industrial"
 

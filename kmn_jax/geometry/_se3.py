@@ -44,7 +44,7 @@ def transform_points(T_target_source: Pose, points: Points) -> Points:
     """Rotate and translate points from the source into the target frame. Raises InputError for other shapes."""
     check_shape(T_target_source, "T_target_source", (4, 4))
     check_shape(points, "points", (None, 3))
-    return rotate_vectors(T_target_source, points) + T_target_source[None, :3, 3]
+    return _product(points, T_target_source[:3, :3].T) + T_target_source[None, :3, 3]
 
 
 def rotate_vectors(T_target_source: Pose, vectors: Normals) -> Normals:

@@ -46,8 +46,9 @@ def kabsch(source: ArrayInput, target: ArrayInput, weights: ArrayInput | None = 
     dtype = jnp.float64 if jnp.float64 in (*(array.dtype for array in arrays), weights.dtype) else jnp.float32
     if used is not None and dtype != jnp.float64 and not any(map(is_traced, arrays)):
         clouds = [np.asarray(points, dtype=np.float64)[used] for points in (source, target)]
+        size = max(map(extent, clouds))
         for points, name in zip(clouds, ("source", "target"), strict=True):
-            check_digits(points, name, max(map(extent, clouds)))
+            check_digits(points, name, size)
     return _fit_rigid(*(array.astype(dtype) for array in (*arrays, weights)))
 
 
