@@ -48,6 +48,12 @@ def check_whole(value: object, name: str, low: int, high: int | None = None) -> 
         raise InputError(f"{name} is {shown(repr(value))}, but must be a whole number {allowed}")
 
 
+def check_type(value: object, kind: type, name: str) -> None:
+    """Raise InputError unless `value` is one of a class."""
+    if not isinstance(value, kind):
+        raise InputError(f"{name} is a {type(value).__name__}, but must be a {kind.__name__}")
+
+
 def number_list(text: str, name: str, *counts: int) -> list[float]:
     """Return the finite numbers of a text with commas between them, as many as one of `counts`."""
     try:

@@ -25,7 +25,10 @@ from kmn_jax.geometry import farthest_point_indices, k_nearest, rotate_vectors, 
 from kmn_jax.io import Scan
 from kmn_jax.models import create_model
 from kmn_jax.objects import ObjectConfig, load_object, make_part
-from kmn_jax.pose import average_precision, discretise_symmetry, match_copies, recall
+from kmn_jax.pose import (
+    IcpConfig, MatchConfig, average_precision, discretise_symmetry, find_matches, icp, match_copies, ransac,
+    ransac_modes, recall,
+)
 from tests.reference.networks import TINY
 
 digest, model = "0" * 64, create_model(TINY, jax.random.key(0))
@@ -60,6 +63,12 @@ calls = {
     "num_true is '2'": lambda: average_precision([], [], "2"),
     "threshold is nan": lambda: match_copies([[0.5]], [True], float("nan")),
     "threshold is not an array": lambda: recall(np.ones(3), 1, "x"),
+    "config is a dict, but must be a MatchConfig": lambda: find_matches(*[points] * 6, 1.0, config={"capacity": 9}),
+    "config is a IcpConfig, but must be a RansacConfig": lambda: ransac(jax.random.key(0), None, IcpConfig()),
+    "config is a MatchConfig": lambda: ransac_modes(jax.random.key(0), None, 2, MatchConfig()),
+    "count is 1.5": lambda: ransac_modes(jax.random.key(0), None, 1.5),
+    "config is a str, but must be a IcpConfig": lambda: icp(points, points, np.eye(4), 1.0, config="point_to_point"),
+    "config is a str, but must be a DetectConfig": lambda: detection.PoseEstimator.from_pretrained(config="fast"),
 }
 for begins, call in calls.items():
     try:

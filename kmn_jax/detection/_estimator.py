@@ -36,7 +36,7 @@ from kmn_jax.detection._sources import (
     unit_words,
 )
 from kmn_jax.detection._timing import Clock
-from kmn_jax.errors import InputError, check_whole, float_array
+from kmn_jax.errors import InputError, check_type, check_whole, float_array
 from kmn_jax.io import (
     CameraMatrix,
     Scan,
@@ -83,13 +83,15 @@ class PoseEstimator:
         Probabilities are those of the calibration beside the file (NAME.calibration.json); without one, those of the
         released network, and each result says so. Raises InputError if there is no such network.
         """
+        config = config or DetectConfig()
+        check_type(config, DetectConfig, "config")
         read_kept()
         path = Path(weights) if Path(weights).suffix == ".safetensors" else released_file(str(weights))
         model = load_model(path)
         own = calibration_beside(path).is_file()
         probabilities = load_probabilities(calibration_beside(path if own else released_file()), EVIDENCE)
         warnings = () if own else (_UNFITTED,)
-        return cls(model, model_digest(model), probabilities, config or DetectConfig(), warnings, str(weights))
+        return cls(model, model_digest(model), probabilities, config, warnings, str(weights))
 
     def prepare(self, source: PartSource, unit: Unit | None = None, name: str | None = None) -> Part:
         """Make a part of a CAD file, a cloud that covers the whole surface, a mesh or an object card.

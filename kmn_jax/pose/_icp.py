@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from kmn_jax.errors import (
     InputError,
+    check_type,
     float_array,
     is_traced,
     mask_array,
@@ -114,6 +115,7 @@ def icp(
     Raises InputError for wrong shapes and dtypes, values that are not finite, points that lie too far from the origin
     for float32, an initial pose that is not rigid and missing normals.
     """
+    check_type(config, IcpConfig, "config")
     object_count = row_count(object_points, "object_points")
     scene_count = row_count(scene_points, "scene_points")
     object_mask = mask_array(object_mask, "object_mask", object_count)

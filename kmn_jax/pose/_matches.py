@@ -11,7 +11,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from kmn_jax.errors import InputError, float_array, is_traced, mask_array, point_array, positive_scalar, require
+from kmn_jax.errors import (
+    InputError,
+    check_type,
+    float_array,
+    is_traced,
+    mask_array,
+    point_array,
+    positive_scalar,
+    require,
+)
 from kmn_jax.geometry import largest
 from kmn_jax.typing import ArrayInput, Normals, Points, Scalar
 
@@ -74,6 +83,7 @@ def find_matches(
     do, under a trace, points with values that are not finite, for which outside of one InputError is raised, as it is
     for wrong shapes and dtypes. No vote at all is a mask without a true.
     """
+    check_type(config, MatchConfig, "config")
     keypoint_logits = float_array(keypoint_logits, "keypoint_logits", (None, None), finite=False)
     n, k = keypoint_logits.shape
     if 0 in (n, k):

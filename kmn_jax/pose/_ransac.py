@@ -11,7 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from kmn_jax.errors import InputError, float_array, is_traced, mask_array, positive_scalar, require, row_count
+from kmn_jax.errors import (
+    InputError,
+    check_type,
+    check_whole,
+    float_array,
+    is_traced,
+    mask_array,
+    positive_scalar,
+    require,
+    row_count,
+)
 from kmn_jax.geometry import from_rotation_translation, largest
 from kmn_jax.pose._kabsch import fit_rigid, rotation_is_determined
 from kmn_jax.pose._matches import Matches
@@ -83,6 +93,7 @@ def ransac(key: ArrayInput, matches: Matches, config: RansacConfig = RansacConfi
 
     Method: arXiv 2303.16102, pose estimation section.
     """
+    check_type(config, RansacConfig, "config")
     key, matches = _checked_key(key), _checked_matches(matches)
     if matches.mask.shape[0] > 0:
         return _first(_ransac(key, matches, config, 1))
@@ -98,8 +109,8 @@ def ransac_modes(key: ArrayInput, matches: Matches, count: int, config: RansacCo
     by more than 0.15 diameters, from those before. Nearly symmetric parts have several; which one is right is for the
     surface to say. The first is that of `ransac`, up to rounding. Errors as there, and for a count below 1.
     """
-    if count < 1:
-        raise InputError(f"count is {count}, but at least one pose is needed")
+    check_whole(count, "count", 1)
+    check_type(config, RansacConfig, "config")
     key, matches = _checked_key(key), _checked_matches(matches)
     if not matches.mask.shape[0]:
         raise InputError("matches is empty: pad it, with a mask, to at least one row")
