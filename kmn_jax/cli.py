@@ -13,7 +13,7 @@ import tyro
 
 from kmn_jax import __version__
 from kmn_jax.arguments import joined, parsed
-from kmn_jax.errors import InputError, require
+from kmn_jax.errors import InputError, check_whole, require
 from kmn_jax.extras import install_command
 from kmn_jax.files import check_inputs, check_outputs, write_whole
 from kmn_jax.printing import drop_what_is_printed, open_closed_streams, say
@@ -77,8 +77,8 @@ def detect(
     from kmn_jax.bop import bop_files
     from kmn_jax.detection import DetectConfig, as_json, table, write_bop_csv, write_json
 
-    if top is not None and top < 1:
-        raise InputError(f"top is {top}, but must be at least 1")
+    if top is not None:
+        check_whole(top, "top", 1)
     read = (*request.files, Path(request.weights), *bop_files(request.scene))
     check_outputs((json, bop_csv, save_picture), *read)
     check_inputs(*request.files)

@@ -25,7 +25,7 @@ from kmn_jax.detection import (
     as_json,
     config_of,
 )
-from kmn_jax.errors import InputError, number_list
+from kmn_jax.errors import InputError, check_whole, number_list
 from kmn_jax.objects import Part
 from kmn_jax.serve._parts import PartStore
 from kmn_jax.units import Unit, check_unit
@@ -100,8 +100,8 @@ class Searches:
 
     def search(self, part: Part, object_name: str, asked: Question) -> tuple[dict[str, Any], str | None]:
         """Return the poses of a part as JSON values, and what the picture is called if one was asked for."""
-        if asked.top is not None and asked.top < 1:
-            raise InputError(f"top is {asked.top}, but must be at least 1")
+        if asked.top is not None:
+            check_whole(asked.top, "top", 1)
         clock = Clock()
         with clock("scene"):
             scene, places = self._scene(part, asked)

@@ -185,7 +185,7 @@ def test_bad_input_is_one_sentence(server: Running, capfd: pytest.CaptureFixture
         (one | {"roi": "1,2,3"}, 400, "roi is '1,2,3', but must be 6 or 9 numbers with commas between them"),
         (one | {"roi": "1,1,1,0,0,0"}, 400, "each min below its max"),
         (one | {"sensor": "nan,0,0"}, 400, "sensor is 'nan,0,0'"),
-        (one | {"top": 0}, 400, "top is 0, but must be at least 1"),
+        (one | {"top": 0}, 400, "top is 0, but must be a whole number of 1 or more"),
         (one | {"units": "km"}, 422, "units: Input should be"),
         (one | {"rio": "0,0,0,1,1,1"}, 422, "'rio' is not known: the fields are scene, part, object, camera, "),
         (one | {"top": ["1", "2"]}, 422, "top is sent 2 times, but has one value"),
