@@ -19,10 +19,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-import tyro
-
+from benchmarks.command import run
 from kmn_jax.errors import InputError
-from kmn_jax.report import check_target, print_table, write_json
+from kmn_jax.report import print_table, write_json
 
 _PART = Path("experiments/assets/industrial/gear_motor.stl")
 _SCENE = Path("experiments/assets/small_test_set/test/000002/depth/000000.png")
@@ -44,9 +43,6 @@ def main(times: int = 5, firsts: int = 1, json: Path | None = None) -> None:
         firsts: processes that begin with an empty one, and searches from Python.
         json: file for the results.
     """
-    check_target(json)
-    if times < 1 or firsts < 1:
-        raise InputError(f"times = {times} and firsts = {firsts} must be 1 or more")
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
         card = Path(scratch) / "part.kmn"
@@ -110,7 +106,4 @@ def _python(name: str, cache: Path | None, *arguments: str) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        tyro.cli(main)
-    except InputError as problem:
-        sys.exit(f"error: {problem}")
+    run(main)

@@ -24,8 +24,8 @@ from typing import Any
 
 import jax
 import numpy as np
-import tyro
 
+from benchmarks.command import run
 from benchmarks.compiled_counts import Counts, Kernel, count
 from benchmarks.compiled_hlo import parse_module
 from benchmarks.compiled_programs import Program, programs
@@ -233,4 +233,4 @@ def _longest(counts: Counts, target: Target) -> list[dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

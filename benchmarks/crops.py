@@ -21,8 +21,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
+from benchmarks.command import run
 from benchmarks.network_cases import map_crops
 from benchmarks.stages import SEARCH, small_crop
 from benchmarks.timing import compile_for, time_in_turn
@@ -205,4 +205,4 @@ def _tally(of: str, image: BinImage, poses: np.ndarray) -> dict[str, int]:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

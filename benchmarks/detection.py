@@ -8,15 +8,14 @@ repeats: once as it is, and once with the inside of the bin as foreground, as wi
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
 from tqdm import tqdm
 
+from benchmarks.command import run
 from experiments.bins import bin_images
 from kmn_jax.detection import PoseEstimator, Scene
 from kmn_jax.errors import InputError
@@ -57,6 +56,8 @@ def main(
             for name, given in (("whole scan", scan), ("inside of the bin", image.scene)):
                 facts = {"bins": folder.name, "foreground": name, "copies": len(image.truth)}
                 rows.append(facts | _row(estimator, image.part, given, repeats))
+    if not rows:
+        raise InputError(f"no image of {', '.join(map(str, folders))} has {fewest} copies: choose a smaller --fewest")
     print_table("Whole bins", rows)
     write_json(json, {"bins": rows})
 
@@ -81,7 +82,4 @@ def _row(estimator: PoseEstimator, part: Part, given: Scan | Scene, repeats: int
 
 if __name__ == "__main__":
     call_in_place()
-    try:
-        tyro.cli(main)
-    except InputError as error:
-        sys.exit(f"detection: {error}")
+    run(main)

@@ -13,7 +13,6 @@ them depends on what else the machine does meanwhile. Both are measured.
 from __future__ import annotations
 
 import os
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -23,15 +22,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
 from jaxtyping import Float
 from tqdm import tqdm
 
+from benchmarks.command import run
 from benchmarks.endurance_frames import Frame, bin_frames, faulty, parts_of, schedule, small_frames
 from kmn_jax.detection import Detections, PoseEstimator
 from kmn_jax.errors import InputError
 from kmn_jax.objects import Part
-from kmn_jax.report import check_target, environment, print_table, write_json
+from kmn_jax.report import environment, print_table, write_json
 from kmn_jax.units import check_unit
 
 WARM = 200  # detections before the level of memory is taken
@@ -65,7 +64,6 @@ def main(detections: int = 10_000, hours: float = 1.0, seed: int = 0, json: Path
         seed: number that the order of frames and faults follows from.
         json: where the verdict and what it is made of goes.
     """
-    check_target(json)
     random, log = np.random.default_rng(seed), Log()
     estimator = PoseEstimator.from_pretrained()
     with tempfile.TemporaryDirectory(prefix="endurance-") as place:
@@ -225,8 +223,4 @@ def _thinned(curves: dict[str, list[float]]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(tyro.cli(main))
-    except InputError as error:
-        print(f"endurance: {error}", file=sys.stderr)
-        sys.exit(2)
+    run(main)

@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import tyro
 from flax import nnx
 
+from benchmarks.command import run
 from benchmarks.network_cases import Case, dense_jax_forward, head_features, make_case, match, points_in_order
 from benchmarks.reference import dense_jax
 from benchmarks.stages import SEARCH, network_call, small_crop
@@ -29,7 +29,7 @@ from kmn_jax.detection import poses_at
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import k_nearest, neighbor_graph, squared_distances
 from kmn_jax.models import released_object, released_scene
-from kmn_jax.report import print_table, write_json
+from kmn_jax.report import print_table, processor, write_json
 
 BASELINE = Path(__file__).with_name("baseline.json")
 LEAST = 0.6  # of the baseline's ratio: below, something has become slower
@@ -67,11 +67,14 @@ def main(update: bool = False, repeats: int = 5, json: Path | None = None) -> in
     ratios = {name: times_faster(pair, repeats) for name, pair in pairs.items()}
     if update:
         write_json(BASELINE, {"ratios": ratios})
-    baseline = json_format.loads(BASELINE.read_text(encoding="utf-8"))["ratios"]
+    found = json_format.loads(BASELINE.read_text(encoding="utf-8"))
+    baseline, its_own = found["ratios"], found["environment"]["processor"]
     ratios = looked_at_again(ratios, baseline, lambda name: times_faster(pairs[name], repeats))
     rows, slower = compared(ratios, baseline)
     print_table("how many times faster ours is", rows)
     write_json(json, {"ratios": ratios})
+    if its_own != processor():
+        print(f"\nthe baseline is of {its_own}, this is {processor()}: ratios differ from machine to machine")
     for name in slower:
         print(f"slower than it was: {name}", file=sys.stderr)
     return 1 if slower else 0
@@ -170,4 +173,4 @@ def _sum_of_squares(outputs: tuple[jax.Array, jax.Array]) -> jax.Array:
 
 
 if __name__ == "__main__":
-    sys.exit(tyro.cli(main))
+    run(main)

@@ -14,8 +14,8 @@ from typing import Any
 
 import jax
 import numpy as np
-import tyro
 
+from benchmarks.command import run
 from benchmarks.network_cases import points_in_order
 from benchmarks.timing import compile_for, time_in_turn
 from kmn_jax.geometry import k_nearest, neighbor_graph, squared_distances
@@ -104,4 +104,4 @@ def _share_right(found: np.ndarray, exact: np.ndarray) -> float:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

@@ -13,9 +13,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from flax import nnx
 
+from benchmarks.command import run
 from benchmarks.memory import peak_of_each
 from benchmarks.network_cases import (
     Case,
@@ -159,4 +159,4 @@ def _rms(outputs: list[np.ndarray], reference: list[np.ndarray]) -> float:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

@@ -15,11 +15,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
+from benchmarks.command import run
 from benchmarks.synthetic import box_surface, synthetic_matches
 from benchmarks.timing import compile_for, time_in_turn
 from experiments.evaluation.rivals import OverMatches
+from kmn_jax.errors import require
 from kmn_jax.geometry import from_rotation_translation, pose_error, random_rotation, rotate_vectors, transform_points
 from kmn_jax.pose import IcpConfig, Matches, RansacConfig, icp, kabsch, ransac
 from kmn_jax.report import print_table, write_json
@@ -43,6 +44,8 @@ def main(
         repeats: timed rounds.
         json: where results go.
     """
+    for share in inlier_shares:
+        require(0 < share <= 1, f"--inlier-shares has {share}, but shares must be above 0 and up to 1")
     success = [row for share in inlier_shares for row in success_rows(share, draws)]
     print_table("2048 matches, 1% noise; success: rotation < 3 degrees and translation < 2% of the diameter", success)
     throughput = [row for batch in batches for row in ransac_rows(batch, repeats)]
@@ -262,4 +265,4 @@ def _open3d_icp(problem: dict[str, jax.Array], plane: bool) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import tyro
 
+from benchmarks.command import run
 from benchmarks.network_cases import make_case
 from benchmarks.stages import Stage, network_call, network_stages, pose_stages, training_stages
 from benchmarks.timing import Ceilings, measure_ceilings, time_in_turn
 from benchmarks.work import Work, total
+from configs import find_config
 from kmn_jax.released import RELEASED
 from kmn_jax.report import print_table, write_json
 
@@ -38,6 +39,8 @@ def main(repeats: int = 15, training: tuple[str, ...] = ("small", "base"), json:
         training: configs of which a training step is timed.
         json: where results go.
     """
+    for name in training:
+        find_config(name)  # before anything is measured
     ceilings = measure_ceilings()
     print(
         f"ceilings here: {ceilings.matmul_flops / 1e9:.0f} GFLOP/s in float32,"
@@ -89,4 +92,4 @@ def _row(name: str, ms: float, work: Work, ceilings: Ceilings) -> dict[str, Any]
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

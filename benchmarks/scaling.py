@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-import tyro
 from flax import nnx
 from jaxtyping import Float
 
+from benchmarks.command import run
 from benchmarks.network_cases import cached_forward, encode_objects, head_features, make_case, match
 from benchmarks.stages import SEARCH, small_case, small_crop
 from benchmarks.synthetic import synthetic_matches
@@ -242,4 +242,4 @@ def _plot(series: Sequence[tuple[Sweep, list[float], Growth]]) -> bytes:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

@@ -13,8 +13,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
+from benchmarks.command import run
 from benchmarks.timing import compile_for, time_in_turn
 from kmn_jax.data import (
     CropConfig,
@@ -167,4 +167,4 @@ def _crop(pack: DevicePack, config: CropConfig, splat: SplatConfig | None, key: 
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

@@ -26,11 +26,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
 from tqdm import tqdm
 
+from benchmarks.command import run
 from kmn_jax.errors import InputError
-from kmn_jax.report import check_target, print_table, write_json
+from kmn_jax.report import print_table, write_json
 
 _PART = Path("experiments/assets/industrial/gear_motor.stl")
 _SCENE = Path("experiments/assets/small_test_set/test/000002")  # bins of that part
@@ -61,7 +61,6 @@ def main(scans: int = 1000, clients: int = 8, json: Path | None = None) -> None:
         clients: that send at once.
         json: where results go.
     """
-    check_target(json)
     bodies = [_form(image) for image in sorted((_SCENE / "depth").glob("*.png"))]
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, _PART.name).symlink_to(_PART.resolve())
@@ -179,4 +178,4 @@ def _resident(pid: int) -> int:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

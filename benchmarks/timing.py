@@ -1,10 +1,9 @@
 """The one timing kernel: compilation apart from running, rivals in turn, device and versions beside every number.
 
 Rules, each against a mistake that changes results: an asynchronous call is timed to `block_until_ready`;
-tracing, compiling and the first run are reported apart; rivals run in turn within one loop, so that a
-machine that slows down slows all of them; each turn begins with a pause and an untimed call, since the rival
-before may still be freeing memory and leave threads spinning; the median of the repeats counts, the spread is
-shown.
+tracing, compiling and the first run are no part of what is timed, and told apart where they are told; rivals run in
+turn within one loop, so that a machine that slows down slows all of them; each turn begins with a pause and an untimed
+call, since the rival before may still be freeing memory and leave threads spinning; the median of the repeats counts.
 """
 
 from __future__ import annotations
@@ -35,7 +34,6 @@ class Compiled:
     trace_s: float
     lower_s: float
     compile_s: float
-    first_run_s: float
     temporary_bytes: int
 
 
@@ -45,12 +43,10 @@ class Steady:
 
     median_ms: float
     minimum_ms: float
-    p90_ms: float
-    repeats: int
 
 
 def compile_for(function: Callable[..., Any], *arguments: Any) -> Compiled:
-    """Trace, lower, compile and run once, each timed on its own. `function` may be jitted already."""
+    """Trace, lower and compile, each timed on its own, and run once. `function` may be jitted already."""
     jitted = function if hasattr(function, "trace") else jax.jit(function)
     start = time.perf_counter()
     traced = jitted.trace(*arguments)
@@ -60,14 +56,12 @@ def compile_for(function: Callable[..., Any], *arguments: Any) -> Compiled:
     compiled = lowered.compile()
     after_compile = time.perf_counter()
     jax.block_until_ready(compiled(*arguments))
-    after_first = time.perf_counter()
     memory = compiled.memory_analysis()
     return Compiled(
         compiled,
         after_trace - start,
         after_lower - after_trace,
         after_compile - after_lower,
-        after_first - after_compile,
         int(getattr(memory, "temp_size_in_bytes", 0)),
     )
 
@@ -88,10 +82,7 @@ def time_in_turn(
                 times[name].append(1e3 * (time.perf_counter() - start))
         if time.perf_counter() - begin > limit_s:
             break
-    return {
-        name: Steady(float(np.median(t)), float(np.min(t)), float(np.percentile(t, 90)), len(t))
-        for name, t in times.items()
-    }
+    return {name: Steady(float(np.median(t)), float(np.min(t))) for name, t in times.items()}
 
 
 @contextmanager

@@ -18,8 +18,8 @@ from typing import Any
 
 import jax
 import numpy as np
-import tyro
 
+from benchmarks.command import run
 from benchmarks.network_cases import make_case
 from benchmarks.timing import time_in_turn
 from configs import find_config
@@ -236,4 +236,4 @@ def torch_step(batch: int) -> Callable[[], None] | None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

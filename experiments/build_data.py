@@ -12,6 +12,8 @@ validation-bins  the 50 validation components in 6 bins each, rendered by ray ca
              them, the other as a structured-light scanner: what the probabilities of detections are fitted on.
 worlds       bins, trays and tables of many kinds (`experiments/worlds.py`), of parts made by parameters: four sets to
              fit probabilities on, of which three are also for the pose verifier, and one to test on.
+cad-folder   the pack of all CAD files in and below a folder, of which every tenth is for validation; with
+             `--pack.drops 0` without bins, as configs with worlds need it.
 per-object   the pack of one part, for a network of its own: 160 training and 160 validation scenes.
 check        what a pack holds: every file against its checksum, every copy against the walls of its bin.
 small        the few objects and images that the repository carries: `assets/small_pack`, `assets/small_test_set`.
@@ -50,7 +52,8 @@ from experiments.test_sets import (
 from experiments.training_parts import PARTS_SEED, TRAINING_FAMILIES
 from experiments.worlds import COMPOUND, TEST, TRAINING, VALIDATION, VERIFIER, Recipe, build_worlds
 from kmn_jax.data import Pack, PackConfig, PackedObject, Record, Source, build_pack
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, check_whole
+from kmn_jax.io import MESH_SUFFIXES
 from kmn_jax.simulate import PERFECT, BinScene, SensorConfig
 
 OUTPUTS = Path("outputs")
@@ -174,6 +177,35 @@ class Worlds:
     def run(self) -> None:
         digests = {f"worlds_{name}": build_worlds(self.folder / name, WORLDS[name], self.workers) for name in self.sets}
         report_digests(digests, self.record)
+
+
+@dataclass(frozen=True)
+class CadFolder:
+    """Build the pack of one's own CAD files, called as they are called in their folder."""
+
+    cad: Path  # their folder
+    folder: Path = OUTPUTS / "packs" / "own"
+    every: int = 10  # so many files one is for validation, the first included
+    workers: int | None = None
+    retry_rejected: bool = False  # try again what an earlier run rejected
+    pack: PackConfig = field(default_factory=PackConfig)
+
+    def run(self) -> None:
+        check_whole(self.every, "every", 2)
+        if not self.cad.is_dir():
+            raise InputError(f"{self.cad} is not a folder: name the one that holds the CAD files")
+        files = sorted(path for path in self.cad.rglob("*") if path.suffix.lower() in MESH_SUFFIXES)
+        if len(files) < 2:
+            raise InputError(
+                f"{self.cad} holds {len(files)} CAD files ({', '.join(MESH_SUFFIXES)}), but a pack needs one for"
+                " training and one for validation"
+            )
+        sources = [
+            Source(path.relative_to(self.cad).as_posix(), "train" if row % self.every else "validation", path)
+            for row, path in enumerate(files)
+        ]
+        records = build_pack(self.folder, sources, self.pack, workers=self.workers, retry_rejected=self.retry_rejected)
+        print_summary(self.folder, records)
 
 
 @dataclass(frozen=True)
@@ -303,6 +335,7 @@ def main() -> None:
                 "test-sets": TestSets,
                 "validation-bins": ValidationBins,
                 "worlds": Worlds,
+                "cad-folder": CadFolder,
                 "per-object": PerObject,
                 "check": Check,
                 "small": Small,

@@ -71,9 +71,12 @@ def build_pack(
     workers = (os.cpu_count() or 1) if workers is None else workers
     if workers < 1:
         raise InputError(f"workers = {workers} must be 1 or more")
-    missing = [str(source.path) for source in sources if not Path(source.path).is_file()]
+    paths = dict.fromkeys(Path(source.path) for source in sources)
+    missing = [path for path in paths if not path.is_file()]
     if missing:
-        raise InputError(f"{len(missing)} of {len(sources)} files are missing, {missing[0]} first: nothing was built")
+        what = "is a folder, and no CAD file" if missing[0].is_dir() else "is missing"
+        more = f", and {len(missing) - 1} more of {len(paths)} are not there" if len(missing) > 1 else ""
+        raise InputError(f"{missing[0]} {what}{more}: nothing was built")
     wanted = {source.name: source for source in sources}
     if len(wanted) != len(sources):
         raise InputError(f"{len(sources) - len(wanted)} sources have the name of another: names must differ")

@@ -109,7 +109,7 @@ def poses_in_cloud(
     order = jnp.argsort(jnp.where(kept, -probability, jnp.inf), stable=True)
     kept = kept[order]
     return BinPoses(
-        jnp.where(kept[:, None, None], poses.T_scene_object[order], jnp.eye(4)[None]),
+        jnp.where(kept[:, None, None], poses.T_scene_object[order], jnp.eye(4, dtype=jnp.float32)[None]),
         jnp.where(kept, probability[order], 0),
         jnp.where(kept, poses.num_inliers[order], 0),
         kept,
@@ -122,7 +122,7 @@ def _cloud(
 ) -> tuple[PaddedCloud, Bool[Array, " r"], Bool[Array, ""]]:
     """Return the points of a depth image in the camera's frame, thinned out to a capacity; which are foreground."""
     fx, fy, cx, cy, *_ = image.camera
-    zero, one = jnp.zeros(()), jnp.ones(())
+    zero, one = jnp.float32(0), jnp.float32(1)
     points = depth_to_points(image.depth, jnp.array([[fx, zero, cx], [zero, fy, cy], [zero, zero, one]])).reshape(-1, 3)
     measured = points[:, 2] > 0
     rows, real = spread_rows(measured, count)

@@ -96,7 +96,7 @@ def poses_in_crop(
                 pose = refined(pose, prediction, part, config)
             return pose.at[:3, 3].add(crop.seed)
 
-        return jax.lax.cond(there, moved, lambda: jnp.eye(4))
+        return jax.lax.cond(there, moved, lambda: jnp.eye(4, dtype=jnp.float32))
 
     poses = map_rows(finished, found, draws, there)
     return CropPoses(

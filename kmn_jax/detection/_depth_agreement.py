@@ -154,5 +154,5 @@ def depth_buffer(
     row, column, z = _pixels(points, ahead, camera)
     inside = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     index = jnp.where(inside, row * width + column, height * width)
-    nearest = jnp.full(height * width, jnp.inf).at[index].min(jnp.where(inside, z, jnp.inf), mode="drop")
+    nearest = jnp.full(height * width, jnp.inf, jnp.float32).at[index].min(jnp.where(inside, z, jnp.inf), mode="drop")
     return jnp.where(jnp.isfinite(nearest), nearest, 0).reshape(height, width)

@@ -88,7 +88,7 @@ def _evidence(
         "covered": _mean(on_object, surface),
         "certainty": _mean(keypoint_scores.max(axis=1), on_object),
         "object_share": _mean(on_object, prediction.mask),
-        VERIFIED: jnp.zeros(()),
+        VERIFIED: jnp.float32(0),
     }
     return jnp.stack([columns[name] for name in EVIDENCE])
 

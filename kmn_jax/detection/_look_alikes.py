@@ -96,11 +96,11 @@ def _laid(
             row, distance = nearest(transform_points(pose, some), surface)
             return kabsch(some, surface[row], 1 / (1 + (distance / _NEAR) ** 2))
 
-        pose = jax.lax.fori_loop(0, _STEPS, step, from_rotation_translation(rotation, jnp.zeros(3)))
+        pose = jax.lax.fori_loop(0, _STEPS, step, from_rotation_translation(rotation, jnp.zeros(3, jnp.float32)))
         return pose, nearest(transform_points(pose, some), surface)[1].mean()
 
     poses, distance = jax.lax.map(lay, rotations)
-    poses = poses.at[0].set(jnp.eye(4))
+    poses = poses.at[0].set(jnp.eye(4, dtype=jnp.float32))
     few = jax.vmap(transform_points, in_axes=(0, None))(symmetries, points[:_COMPARED]).reshape(-1, 3)
     looks = jax.vmap(transform_points, in_axes=(0, None))(poses, few)
     looks = looks.reshape(len(rotations), -1, _COMPARED, 3)

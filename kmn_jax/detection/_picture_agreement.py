@@ -196,7 +196,7 @@ def _outline(seen: Predicted, found: Measured, compared: Bool[Array, "s s"], dia
     # The plane of what is measured on the object near by.
     count, normal, center = (
         summed(jnp.where(compared[..., None], values, 0), _REACH)
-        for values in (jnp.ones((PICTURE_SIDE, PICTURE_SIDE, 1)), found.normals, found.points)
+        for values in (jnp.ones((PICTURE_SIDE, PICTURE_SIDE, 1), jnp.float32), found.normals, found.points)
     )
     normal = normal / jnp.sqrt(jnp.maximum((normal**2).sum(axis=-1, keepdims=True), 1e-24))
     height = ((found.points - center / jnp.maximum(count, 1)) * normal).sum(axis=-1) / diameter

@@ -109,11 +109,11 @@ def predicted(T_camera_object: Pose, surfels: Surfels, image: DepthImage, side: 
     pitch = jnp.maximum((high - low).max() / (_CELLS - 1), finest)
     place = jnp.round((directions - low[None]) / pitch).astype(jnp.int32) + spare
     index = place[:, 1] * side + place[:, 0]
-    front = jnp.full(side**2, jnp.inf).at[jnp.where(facing, index, side**2)].min(z, mode="drop")
+    front = jnp.full(side**2, jnp.inf, jnp.float32).at[jnp.where(facing, index, side**2)].min(z, mode="drop")
     # The surface of a cell is what lies about as near as its nearest point.
     shown = facing & (z <= front[jnp.clip(index, 0, side**2 - 1)] + spacing + pitch * nearest)
     columns = jnp.concatenate([normals, z[:, None], jnp.ones_like(z)[:, None]], axis=1)
-    sums = jnp.zeros((side**2, 5)).at[jnp.where(shown, index, side**2)].add(columns, mode="drop")
+    sums = jnp.zeros((side**2, 5), jnp.float32).at[jnp.where(shown, index, side**2)].add(columns, mode="drop")
     mask = (sums[:, 4] > 0).reshape(side, side)
     length = jnp.sqrt(jnp.maximum((sums[:, :3] ** 2).sum(axis=1, keepdims=True), 1e-12))
     steps = (jnp.arange(side, dtype=jnp.float32) - spare) * pitch

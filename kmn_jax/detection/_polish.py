@@ -87,8 +87,8 @@ def polished(pose: Pose, part: DevicePart, image: DepthImage) -> Pose:
     def is_moving(state: _State) -> Bool[Array, ""]:
         return (state.step < _ROUNDS) & (state.change > _STILL)
 
-    start = from_rotation_translation(pose[:3, :3], jnp.zeros(3))
-    end = repeat_while(is_moving, moved_on, _State(jnp.int32(0), start, jnp.array(jnp.inf)), _ROUNDS).pose
+    start = from_rotation_translation(pose[:3, :3], jnp.zeros(3, jnp.float32))
+    end = repeat_while(is_moving, moved_on, _State(jnp.int32(0), start, jnp.float32(jnp.inf)), _ROUNDS).pose
     before, after = fit(start), fit(end)
     tolerance = reach(after)
 

@@ -128,7 +128,7 @@ def _k_smallest_at_once(
     halves = 0.5 * (points**2).sum(axis=1, keepdims=True)
     if mask is not None:
         points, halves = jnp.where(mask[:, None], points, 0), jnp.where(mask[:, None], halves, _FAR)
-    queries = jnp.concatenate([queries, jnp.ones((queries.shape[0], 1))], axis=1)
+    queries = jnp.concatenate([queries, jnp.ones((queries.shape[0], 1), queries.dtype)], axis=1)
     points = jnp.concatenate([points, -halves], axis=1)
     values, indices = largest_in_any_order(jnp.matmul(queries, points.T, precision=jax.lax.Precision.HIGHEST), k)
     values = jnp.where(values < -_FAR / 2, -jnp.inf, values)

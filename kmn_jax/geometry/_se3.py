@@ -115,12 +115,12 @@ def pose_error(T_a: Pose, T_b: Pose) -> tuple[Scalar, Scalar]:
 
 def random_rotation(key: PRNGKey) -> Rotation:
     """Draw a rotation matrix uniformly from all rotations."""
-    return quaternion_to_matrix(jax.random.normal(key, (4,)))
+    return quaternion_to_matrix(jax.random.normal(key, (4,), jnp.float32))
 
 
 def random_pose(key: PRNGKey, translation_scale: Scalar | float = 1.0) -> Pose:
     """Draw a pose with a uniform rotation and a normal translation, whose coordinates have this deviation."""
     rotation_key, translation_key = jax.random.split(key)
     return from_rotation_translation(
-        random_rotation(rotation_key), translation_scale * jax.random.normal(translation_key, (3,))
+        random_rotation(rotation_key), translation_scale * jax.random.normal(translation_key, (3,), jnp.float32)
     )

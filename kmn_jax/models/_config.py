@@ -107,6 +107,12 @@ class KeyMatchNetConfig:
             f"{self.num_keypoints} keypoints cannot be drawn from {self.num_object_points} object points",
         )
 
+        fewest = min(self.num_scene_points, self.num_object_points)
+        require(
+            self.num_neighbors <= fewest,
+            f"num_neighbors is {self.num_neighbors}, but clouds have only {fewest} points",
+        )
+
     def told(self) -> dict[str, Any]:
         """Return all fields but those that networks of before do not have, where this one goes without, too.
 

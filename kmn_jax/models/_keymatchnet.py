@@ -79,7 +79,7 @@ class KeyMatchNet(nnx.Module):
             self.object_out = NormalizedLinear(config.scene_width, config.object_width, config.groups, rngs=rngs)
         else:
             shape = config.num_keypoints, config.object_width
-            self.keypoints = nnx.Param(jax.random.normal(rngs.params(), shape))
+            self.keypoints = nnx.Param(jax.random.normal(rngs.params(), shape, jnp.float32))
         self.head = PairHead(config.scene_width, config.object_width, config.pair_width, config.groups, rngs=rngs)
         own, other = config.scene_width, config.object_width
         self.to_object = Attention(own, other, other, config.groups, rngs=rngs) if config.attention == "both" else None

@@ -193,8 +193,8 @@ class NormalizedLinear(nnx.Module):
 
     def __init__(self, in_features: int, out_features: int, groups: int, *, rngs: nnx.Rngs) -> None:
         self.kernel = nnx.Param(drawn_kernel(in_features, out_features, rngs))
-        self.norm_scale = nnx.Param(jnp.ones(out_features))
-        self.norm_bias = nnx.Param(jnp.zeros(out_features))
+        self.norm_scale = nnx.Param(jnp.ones(out_features, jnp.float32))
+        self.norm_bias = nnx.Param(jnp.zeros(out_features, jnp.float32))
         self.groups = groups
 
     def affine(self, moments: Moments) -> ChannelAffine:

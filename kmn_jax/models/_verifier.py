@@ -39,7 +39,7 @@ class _Affine(nnx.Module):
 
     def __init__(self, shape: tuple[int, ...], stride: int = 1, *, rngs: nnx.Rngs) -> None:
         self.kernel = nnx.Param(nnx.initializers.he_normal()(rngs.params(), shape, jnp.float32))
-        self.bias = nnx.Param(jnp.zeros(shape[-1]))
+        self.bias = nnx.Param(jnp.zeros(shape[-1], jnp.float32))
         self.stride = stride
 
     def of_row(self, x: Float[Array, " i"]) -> Float[Array, " o"]:

@@ -52,7 +52,8 @@ def released_file(name: str = RELEASED) -> Path:
     path = PRETRAINED / f"{name}.safetensors"
     if not path.is_file():
         names = ", ".join(sorted(file.stem for file in PRETRAINED.glob("*.safetensors"))) or "none"
-        raise InputError(f"there is no released model {name!r}: there are {names}")
+        own = "; of a run's folder, name its model.safetensors" if Path(name).is_dir() else ""
+        raise InputError(f"there is no released model {name!r}: there are {names}{own}")
     return path
 
 

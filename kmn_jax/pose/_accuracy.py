@@ -39,7 +39,7 @@ def symmetric_pose_error(
     if not any(map(is_traced, (*poses, place))):
         given = (np.asarray(value, dtype=np.float64) for value in (T_estimated, T_true, center))
         poses = [jnp.asarray(pose) for pose in about_the_object(*given)]
-        place = jnp.zeros(3)
+        place = jnp.zeros(3, jnp.float32)
     arrays = (*poses, rotations, axes, place)
     return _symmetric_pose_error(*(array.astype(jnp.float32) for array in arrays))
 
@@ -68,7 +68,7 @@ def _symmetric_pose_error(
 
     # Differences first, so that digits far from the origin are kept.
     apart = T_estimated[:3, 3] - T_true[:3, 3] + product(estimated - true, center)
-    rotation = jnp.zeros(()) if len(axes) > 1 else jax.vmap(angle)(rotations).min()
+    rotation = jnp.zeros((), jnp.float32) if len(axes) > 1 else jax.vmap(angle)(rotations).min()
     return rotation, safe_norm(apart)
 
 

@@ -229,9 +229,9 @@ def _icp(
     def is_moving(state: _State) -> Bool[Array, ""]:
         return (state.step < config.iterations) & (state.change > config.tolerance)
 
-    start = from_rotation_translation(initial[:3, :3], jnp.zeros(3))
+    start = from_rotation_translation(initial[:3, :3], jnp.zeros_like(initial[:3, 3]))
     first = find_pairs(start)
-    state = _State(jnp.int32(0), start, first, jnp.array(jnp.inf), jnp.array(True))
+    state = _State(jnp.int32(0), start, first, jnp.float32(jnp.inf), jnp.array(True))
     state = repeat_while(is_moving, iterate, state, config.iterations)
 
     status = first_status(
@@ -281,6 +281,8 @@ def plane_step(moved: Points, normals: Normals, residual: Float[Array, " n"], we
     sums = jnp.matmul((weights[:, None] * rows).T, rows, precision=jax.lax.Precision.HIGHEST)
     system = sums[:6, :6]
     damping = _DAMPING * jnp.trace(system) / 6
-    solution = solve_symmetric(system + jnp.where(damping > 0, damping, 1) * jnp.eye(6), -sums[:6, 6])
+    solution = solve_symmetric(
+        system + jnp.where(damping > 0, damping, 1) * jnp.eye(6, dtype=system.dtype), -sums[:6, 6]
+    )
     # A quaternion of any length turns by a proper rotation, also when the linear step is not small.
-    return from_quaternion_translation(jnp.concatenate([jnp.ones(1), solution[:3] / 2]), solution[3:])
+    return from_quaternion_translation(jnp.concatenate([jnp.ones(1, solution.dtype), solution[:3] / 2]), solution[3:])

@@ -230,7 +230,7 @@ def _turns(axis: Float[Array, "3"], offset: Float[Array, "3"], count: int) -> Fl
     quaternions = jnp.concatenate([jnp.cos(half)[:, None], jnp.sin(half)[:, None] * unit[None, :]], axis=1)
 
     def turn(quaternion: Float[Array, "4"]) -> Pose:
-        about_origin = from_quaternion_translation(quaternion, jnp.zeros(3))
+        about_origin = from_quaternion_translation(quaternion, jnp.zeros_like(axis))
         return about_origin.at[:3, 3].set(offset - (about_origin[:3, :3] * offset[None, :]).sum(axis=1))
 
     return jax.vmap(turn)(quaternions)

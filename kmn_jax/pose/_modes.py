@@ -39,7 +39,7 @@ class Pairs(NamedTuple):
 
     def inliers(self, pose: Pose, gate: Scalar | float) -> tuple[Mask, Float[Array, " n"]]:
         """Return which matches agree with a pose, and the squared distances: under vmap it stays one fused loop."""
-        squares, cosines = jnp.zeros(()), jnp.zeros(())
+        squares, cosines = jnp.float32(0), jnp.float32(0)
         for row in range(3):
             r0, r1, r2, shift = pose[row, 0], pose[row, 1], pose[row, 2], pose[row, 3]
             x, y, z = self.object_points[:, 0], self.object_points[:, 1], self.object_points[:, 2]
@@ -82,7 +82,7 @@ def _at_once(
     """Return the same, up to rounding, by refitting all hypotheses before it is known which are the best."""
     p, q = pairs.object_points, pairs.scene_points
     products = [(q[:, :, None] * p[:, None, :]).reshape(-1, 9), (p[:, :, None] * p[:, None, :]).reshape(-1, 9)]
-    terms = pairs.weights[:, None] * jnp.concatenate([jnp.ones((len(p), 1)), p, q, *products], axis=1)
+    terms = pairs.weights[:, None] * jnp.concatenate([jnp.ones((len(p), 1), p.dtype), p, q, *products], axis=1)
 
     def refit(poses: Float[Array, "h 4 4"], gate: Scalar) -> tuple[Float[Array, "h 4 4"], None]:
         inside = jax.vmap(lambda pose: pairs.inliers(pose, gate)[0])(poses).astype(jnp.float32)

@@ -97,7 +97,7 @@ def ransac(key: ArrayInput, matches: Matches, config: RansacConfig = RansacConfi
     key, matches = _checked_key(key), _checked_matches(matches)
     if matches.mask.shape[0] > 0:
         return _first(_ransac(key, matches, config, 1))
-    padding = {name: jnp.zeros((1, *getattr(matches, name).shape[1:])) for name in Matches._fields[:5]}
+    padding = {name: jnp.zeros((1, *getattr(matches, name).shape[1:]), jnp.float32) for name in Matches._fields[:5]}
     result = _first(_ransac(key, matches._replace(**padding, mask=jnp.zeros(1, dtype=bool)), config, 1))
     return result._replace(inlier_mask=result.inlier_mask[:0])
 
@@ -178,7 +178,9 @@ def _ransac(key: PRNGKey, matches: Matches, config: RansacConfig, num_modes: int
     )
 
     triplets, is_candidate = _congruent_triplets(key, object_points, scene_points, usable, config)
-    poses = jax.vmap(fit_rigid, in_axes=(0, 0, None))(object_points[triplets], scene_points[triplets], jnp.ones(3))
+    poses = jax.vmap(fit_rigid, in_axes=(0, 0, None))(
+        object_points[triplets], scene_points[triplets], jnp.ones(3, jnp.float32)
+    )
 
     counts = jax.vmap(lambda pose: pairs.inliers(pose, config.distance_gate)[0].sum(dtype=jnp.int32))(poses)
 
@@ -227,7 +229,7 @@ def _congruent_triplets(
     count = usable.shape[0]
     order = jnp.nonzero(usable, size=count, fill_value=0)[0]
     num_usable = usable.sum(dtype=jnp.int32)
-    uniform = jax.random.uniform(key, (3, config.num_candidates))
+    uniform = jax.random.uniform(key, (3, config.num_candidates), jnp.float32)
     rank = jnp.floor(uniform * num_usable.astype(jnp.float32)).astype(jnp.int32)
     triplets = order[jnp.clip(rank, 0, jnp.maximum(num_usable - 1, 0))]
     corners = jnp.concatenate([object_points, scene_points], axis=1)[triplets]

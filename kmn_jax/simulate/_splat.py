@@ -192,7 +192,7 @@ class DepthBuffer(NamedTuple):
 def place_surfels(surfels: Surfels, T_camera_object: Float[Array, "c 4 4"], copies: Bool[Array, " c"]) -> PlacedSurfels:
     """Return the surfels of all copies in the camera frame; those of each, if they have a leading axis for copies."""
     m = surfels.points.shape[-2]
-    pose = jnp.where(copies[:, None, None], T_camera_object.astype(jnp.float32), jnp.eye(4)[None])
+    pose = jnp.where(copies[:, None, None], T_camera_object.astype(jnp.float32), jnp.eye(4, dtype=jnp.float32)[None])
 
     def rotated(vectors: Float[Array, "*c m 3"]) -> list[Float[Array, " r"]]:
         # Not as a product of matrices: what follows is computed with it in one go.
@@ -266,7 +266,7 @@ def draw_discs(placed: PlacedSurfels, drawn: Mask, spacing: Float[Array, "*rows"
     mean_depth = jnp.where(some, jnp.where(drawn, z, 0).sum() / jnp.maximum(count, 1).astype(jnp.float32), 1)
     finest = _PIXEL * spacing.min() / mean_depth
     pitch = [jnp.maximum((end - begin) / (size - 1), finest) for begin, end in zip(low, high, strict=True)]
-    buffer = DepthBuffer(jnp.full(size * size, jnp.inf), (low[0], low[1]), (pitch[0], pitch[1]))
+    buffer = DepthBuffer(jnp.full(size * size, jnp.inf, jnp.float32), (low[0], low[1]), (pitch[0], pitch[1]))
     columns, rows = _pixels(placed.points, buffer)
     nearest_column, nearest_row = jnp.round(columns), jnp.round(rows)
     first_column, first_row = jnp.floor(columns), jnp.floor(rows)

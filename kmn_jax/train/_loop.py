@@ -26,7 +26,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array
 
 from kmn_jax.data import BatchIterator, SampleIndex
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, require
 from kmn_jax.files import write_whole
 from kmn_jax.models import model_structure, save_model
 from kmn_jax.report import check_target
@@ -95,13 +95,15 @@ def train(
 
     Raises:
         InputError: a folder with a run and no `resume`, or in which another process trains, a config that differs
-            from the run's, data that cannot be used, batches that devices cannot share, or a full disk.
+            from the run's or is of fewer steps than it has made, double precision, data that cannot be used, batches
+            that devices cannot share, or a full disk.
         NotFiniteError: a loss or gradient was not finite; state and batch are in the run's folder `nan`.
     """
     folder = Path(folder)
     stop = StopRequest(max_minutes)
     # By one process, or the others might find what it has just written.
     from_first_process(lambda: _check_free(folder, resume))
+    require(not jax.config.values["jax_enable_x64"], "training is in single precision: turn JAX_ENABLE_X64 off")
     run = _Run(config, folder, data_mesh(), stop, report or _print)
     with ExitStack() as held:
         from_first_process(lambda: held.enter_context(only_one(folder)))
@@ -155,9 +157,11 @@ class _Run:
         if found is None:
             from_first_process(self._check_none)
         else:
-            check_same(self.folder, found.facts.get("config", {}), asdict(self.config), _FREE)
+            before = found.facts.get("config", {})
+            check_same(self.folder, before, asdict(self.config), _FREE)
             self._take(found)
             self.report(f"going on at step {self.step} of {self.config.num_steps}")
+            self._check_length(before.get("num_steps", self.config.num_steps))
         if self.first:
             check_target(self.folder / "config.json")
             write_config(self.folder, asdict(self.config))
@@ -172,6 +176,17 @@ class _Run:
             raise InputError(
                 f"all checkpoints in {self.checkpoints.folder} are damaged (steps {steps}): put back a copy of one, or"
                 " choose another folder to begin anew"
+            )
+
+    def _check_length(self, before: int) -> None:
+        """Say what another length than before makes of the learning rate, which follows from it."""
+        step, length = self.step, self.config.num_steps
+        if step > length:
+            raise InputError(f"num_steps = {length}, but the run in {self.folder} has made {step} steps: choose more")
+        if step < length != before:
+            rate = self.config.optimizer.rates(before)[min(step, before - 1)]
+            self.report(
+                f"the run was of {before} steps: its learning rate was {rate:.2g} here, {self.rates[step]:.2g} now"
             )
 
     def loop(self, progress: bool) -> Outcome:

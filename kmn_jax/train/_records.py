@@ -90,11 +90,16 @@ def check_same(folder: Path, old: Mapping[str, Any], new: Mapping[str, Any], fre
     Dots join the names of nested values. Names that the old one lacks, because an earlier version knew none of them,
     are passed over.
     """
+    what = what_differs(old, new, free)
+    if what:
+        raise InputError(f"{folder} holds a run with {what}: resume with the same values, or choose another folder")
+
+
+def what_differs(old: Mapping[str, Any], new: Mapping[str, Any], free: tuple[str, ...] = ()) -> str:
+    """Return in words up to four values, of those that the old config has, which differ from a new one's, if any."""
     old, new = _flat(dict(old)), _flat(parse_json(json.dumps(new)))
     changed = [name for name in sorted(old) if old[name] != new.get(name) and name not in free]
-    if changed:
-        what = ", ".join(f"{name} = {old[name]}, not {new.get(name)}" for name in changed[:4])
-        raise InputError(f"{folder} holds a run with {what}: resume with the same values, or choose another folder")
+    return ", ".join(f"{name} = {old[name]}, not {new.get(name)}" for name in changed[:4])
 
 
 def write_session(folder: Path, step: int, facts: Mapping[str, Any]) -> None:

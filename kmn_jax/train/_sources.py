@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import jax
@@ -16,12 +16,23 @@ from kmn_jax.data import DevicePack, Pack, PipelineConfig, SampleBatches, Sample
 from kmn_jax.errors import InputError
 from kmn_jax.models import KeyMatchNetConfig, load_model, load_pretrained, with_chiral_inputs
 from kmn_jax.train._config import TrainConfig
+from kmn_jax.train._records import what_differs
 from kmn_jax.train._rendered import rendered_frames
 from kmn_jax.train._sharding import put_whole
 from kmn_jax.train._step import Samples
 
 Report = Callable[[str], None]  # is given one sentence for each object or image that is left out
 
+_WITHOUT_PARAMETERS = (
+    "num_scene_points",
+    "num_object_points",
+    "num_keypoints",
+    "num_neighbors",
+    "graph",
+    "dropout",
+    "pair_dropout",
+    "compute",
+)
 _VALIDATION_SEED = 0  # of the samples, so that runs of all seeds are validated on the same
 
 
@@ -89,22 +100,20 @@ def warm_parameters(config: TrainConfig) -> nnx.State | None:
     model = load_model(config.warm_start) if known else load_pretrained(config.warm_start)
     if config.network.inputs == "chiral" and model.config.inputs == "invariant":
         model = with_chiral_inputs(model)
-    if _for_data_of(config.network, model.config) != config.network:
-        raise InputError(f"warm_start = {config.warm_start} holds another network than the config's: leave it out")
+    theirs = _for_data_of(config.network, model.config)
+    if theirs != config.network:
+        raise InputError(
+            f"warm_start = {config.warm_start} is a network with"
+            f" {what_differs(asdict(theirs), asdict(config.network))}: choose the same, or leave it out"
+        )
     return model.parameters
 
 
 def _for_data_of(other: KeyMatchNetConfig, config: KeyMatchNetConfig) -> KeyMatchNetConfig:
-    """Return a network's config with another's graph and sizes of data, as far as its parameters fit both."""
+    """Return a network's config with what of another's has no parameters, so that its own fit both."""
     if config.object_branch == "learned":  # it has parameters for each keypoint
         return config
-    return replace(
-        config,
-        num_scene_points=other.num_scene_points,
-        num_object_points=other.num_object_points,
-        num_keypoints=other.num_keypoints,
-        graph=other.graph,
-    )
+    return replace(config, **{name: getattr(other, name) for name in _WITHOUT_PARAMETERS})
 
 
 def _packed_source(

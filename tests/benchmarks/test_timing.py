@@ -20,7 +20,7 @@ from kmn_jax.report import check_target, print_table, write_json
 
 def test_compilation_is_apart_from_running() -> None:
     ready = compile_for(lambda x: jnp.sin(x) @ x.T, jnp.ones((200, 200)))
-    assert min(ready.trace_s, ready.lower_s, ready.compile_s, ready.first_run_s) > 0
+    assert min(ready.trace_s, ready.lower_s, ready.compile_s) > 0
     np.testing.assert_allclose(ready.function(jnp.ones((200, 200)))[0, 0], 200 * np.sin(1), rtol=1e-5)
 
 
@@ -38,7 +38,7 @@ def test_rivals_run_in_turn_and_the_median_counts() -> None:
     times = time_in_turn({"slow": rival("slow", 0.02), "fast": rival("fast", 0.002)}, repeats=4)
     assert times["slow"].median_ms >= 20
     assert times["slow"].median_ms > 3 * times["fast"].median_ms
-    assert times["slow"].repeats >= 4
+    assert calls.count("slow") >= 4 + 2  # of which two are untimed
     assert calls[:8] == ["slow"] * 4 + ["fast"] * 4, "an untimed call, then three timed ones"
 
 

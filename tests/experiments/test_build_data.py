@@ -83,7 +83,14 @@ def test_extracts_only_what_is_named_from_the_package(tmp_path: Path, monkeypatc
     ("arguments", "message"),
     [
         (["electronics", "--models", "absent"], "error: absent is not a folder"),
-        (["electronics", "--models", "experiments"], "1507 of 1507 files are missing"),
+        (
+            ["electronics", "--models", "experiments"],
+            " is missing, and 1506 more of 1507 are not there: nothing was built",
+        ),
+        (["per-object", "--cad", "experiments"], "experiments is a folder, and no CAD file: nothing was built"),
+        (["cad-folder", "--cad", "README.md"], "README.md is not a folder"),
+        (["cad-folder", "--cad", "docs"], "docs holds 0 CAD files (.stl, "),
+        (["cad-folder", "--cad", "docs", "--every", "1"], "every is 1, but must be a whole number of 2 or more"),
         (["electronics", "--models", "experiments", "--limit", "0"], "limit = 0 must be 1 or more"),
         (["electronics", "--pack.drops", "-1"], "drops = -1 must be 0 or more"),
         (["check", "--folder", "experiments"], "manifest.json cannot be read"),
@@ -243,6 +250,19 @@ def test_show_data_names_what_is_missing(tmp_path: Path) -> None:
     assert result.returncode == 1
     assert result.stderr.startswith("error: ")
     assert "manifest.json cannot be read" in result.stderr
+
+
+def test_packs_are_made_of_ones_own_files(tmp_path: Path) -> None:
+    cad = tmp_path / "cad"
+    (cad / "more").mkdir(parents=True)
+    assets = ROOT / "experiments" / "assets" / "industrial"
+    for name, source in (("b.stl", "screw"), ("more/c.STL", "gear_motor"), ("a.stl", "screw")):
+        shutil.copy(assets / f"{source}.stl", cad / name)
+    (cad / "notes.txt").touch()
+    build_data.CadFolder(cad, tmp_path / "pack", every=2, workers=1, pack=PackConfig(drops=0)).run()
+    pack = Pack(tmp_path / "pack")
+    assert (pack.names("validation"), pack.names("train")) == (["a.stl", "more/c.STL"], ["b.stl"])
+    assert not pack.problems()
 
 
 def test_surfels_are_of_components_and_of_parts_made_by_parameters(

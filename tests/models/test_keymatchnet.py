@@ -231,6 +231,7 @@ def test_parameter_count_is_the_published_one() -> None:
         ({"edge_width": 33}, "multiple of groups"),
         ({"groups": 0}, "at least 1"),
         ({"num_neighbors": 2.5}, "whole number"),
+        ({"num_neighbors": 200, "num_scene_points": 128}, "num_neighbors is 200, but clouds have only 128 points"),
         ({"compute": "float16"}, "one of float32, tf32, bfloat16"),
         ({"normalization": "relased"}, "one of metric, released"),
         ({"dropout": 1.0}, r"in \[0, 1\)"),

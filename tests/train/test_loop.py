@@ -233,10 +233,12 @@ def test_no_time_left_saves_and_a_copied_folder_goes_on_elsewhere(
     whole: tuple[Path, Outcome], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     here, there = tmp_path / "here", tmp_path / "there"
+    told: list[str] = []
 
     def call(folder: Path, *arguments: object, num_steps: int = 6) -> tuple[int, str, str]:
         code = main([*flags(num_steps=num_steps), "--folder", str(folder), *map(str, arguments)])
         output, errors = capsys.readouterr()
+        told.append(output)
         return code, output.splitlines()[-1].partition(";")[0] if output else "", errors
 
     assert call(here, "--max-minutes", "0")[:2] == (0, "stopped after step 0 of 6 because 0 minutes are over")
@@ -247,6 +249,7 @@ def test_no_time_left_saves_and_a_copied_folder_goes_on_elsewhere(
     assert code == 2
     assert errors == f"train: {there} holds a run: resume it, or choose another folder\n"
     assert call(there, "--resume")[:2] == (0, "done: 6 steps")
+    assert "the run was of 3 steps: its learning rate was" in told[-1]
     assert [row["step"] for row in read_metrics(there)] == [3, 3, 4, 6, 6]  # the run of three wrote its own last row
     assert_same_states(there, whole[0])
 
@@ -259,6 +262,10 @@ def test_checkpoints_know_their_config(whole: tuple[Path, Outcome], tmp_path: Pa
         train(tiny(), folder)
     with pytest.raises(InputError, match="holds a run with random_seed = 0, not 1"):
         train(tiny(random_seed=1), folder, resume=True)
+    written = digest(folder)
+    with pytest.raises(InputError, match=r"num_steps = 5, but the run in .* has made 6 steps: choose more"):
+        train(tiny(num_steps=5), folder, resume=True)
+    assert digest(folder) == written
     # What the last steps are spent on may change.
     train(tiny(**{"examples.random_keypoints": 0.5}), folder, resume=True)
 
