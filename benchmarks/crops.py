@@ -1,6 +1,6 @@
 """From points to refined poses by the released network: beside Open3D, at growing batches, and a whole bin in one call.
 
-python -m benchmarks.crops [--batches 1 4 16 64] [--folder DATASET] [--json FILE]
+python -m benchmarks.crops [--batches 1 4 16 64] [--folder DATASET] [--weights FILE] [--json FILE]
 
 Open3D's FPFH and RANSAC get the same crops; their poses are counted and timed without refinement and with the ICP that
 all methods of an evaluation share, ours with the refinement of the same call.
@@ -57,6 +57,7 @@ def main(
     every: int = 1,
     seeds: int = 32,
     repeats: int = 9,
+    weights: str = RELEASED,
     json: Path | None = None,
 ) -> None:
     """Run all tables.
@@ -67,13 +68,14 @@ def main(
         every: every so many images of it.
         seeds: crops that a bin's call searches.
         repeats: timed rounds.
+        weights: released network, or a .safetensors file.
         json: where results go.
     """
-    estimator = PoseEstimator.from_pretrained()
+    estimator = PoseEstimator.from_pretrained(weights)
     same = [row for found in bop_objects(folder, "test", print) for row in same_crops(estimator.model, found, repeats)]
     print_table("the same crops, 1% noise, one after another", same)
-    crops = [crop_row(batch, repeats) for batch in batches]
-    print_table(f"crops to refined poses, `{RELEASED}`", crops)
+    crops = [crop_row(estimator.model, batch, repeats) for batch in batches]
+    print_table(f"crops to refined poses, `{weights}`", crops)
     config = BinPosesConfig(num_seeds=seeds)
     images = bin_images(folder, "test", estimator.model, every)
     bins = [bin_row(estimator, image, config, repeats) for image in images]
@@ -134,9 +136,9 @@ def _error(pose: np.ndarray, case: Case, model: ObjectModel) -> float:
     return float(pair_errors(pairs, model).min())
 
 
-def crop_row(batch: int, repeats: int) -> dict[str, Any]:
+def crop_row(model: Model, batch: int, repeats: int) -> dict[str, Any]:
     """Time the same crop, many times at once, each with draws of its own."""
-    model, part, cloud = small_crop()
+    _, part, cloud = small_crop(model)
     config = SEARCH.of_network(model.config)
     keys = jax.random.split(jax.random.key(0), batch)
     clouds = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (batch, *leaf.shape)), cloud)

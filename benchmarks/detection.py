@@ -23,6 +23,7 @@ from kmn_jax.geometry import measured_points
 from kmn_jax.io import Scan
 from kmn_jax.objects import Part
 from kmn_jax.programs import call_in_place
+from kmn_jax.released import RELEASED
 from kmn_jax.report import print_table, write_json
 
 
@@ -32,6 +33,7 @@ def main(
     fewest: int = 8,
     repeats: int = 3,
     cards: Path | None = None,
+    weights: str = RELEASED,
     json: Path | None = None,
 ) -> None:
     """Time all images.
@@ -42,9 +44,10 @@ def main(
         fewest: copies in a bin; bins of fewer are left out.
         repeats: timed searches of each, after a first one.
         cards: a folder for each dataset with cards of its objects, made by `kmn prepare`, where Open3D is missing.
+        weights: released network, or a .safetensors file.
         json: where results go.
     """
-    estimator = PoseEstimator.from_pretrained()
+    estimator = PoseEstimator.from_pretrained(weights)
     rows = []
     for folder in folders:
         images = bin_images(folder, split, estimator.model, cards=cards and cards / folder.name)

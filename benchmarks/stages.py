@@ -63,9 +63,9 @@ class SmallCrop(NamedTuple):
     cloud: PaddedCloud
 
 
-def small_crop() -> SmallCrop:
-    """Return the crop of `small_case`, as calls take it."""
-    model = load_pretrained()
+def small_crop(model: Model | None = None) -> SmallCrop:
+    """Return the crop of `small_case`, as calls of a model take it, the released one unless given."""
+    model = model or load_pretrained()
     found, case = small_case()
     return SmallCrop(model, arrays_of(model, make_part(found, model)), padded(case.points))
 

@@ -44,7 +44,7 @@ def compare(options: Options) -> list[dict[str, Any]]:
     require_made(options.dataset)
     models = {found.name: found.model for found in bop_objects(options.dataset, options.split, print)}
     titles = {name: name for name in options.methods}
-    folders = [_opened(folder) for folder in (options.before, options.after)]
+    folders = [_opened(folder, options.noises) for folder in (options.before, options.after)]
     before, after = (cells_of(folder, models, titles, options.noises) for folder in folders)
     _check_crops(folders, list(models), options.noises)
     rows = []
@@ -70,11 +70,16 @@ def compare(options: Options) -> list[dict[str, Any]]:
     return rows
 
 
-def _opened(folder: Path) -> Export:
+def _opened(folder: Path, noises: tuple[float, ...]) -> Export:
+    """Return a folder of an evaluation. Raises InputError if it is none, or without crops of a noise."""
     try:
-        return Export(folder, json.loads((folder / "recipe.json").read_text(encoding="utf-8")))
+        found = Export(folder, json.loads((folder / "recipe.json").read_text(encoding="utf-8")))
     except (OSError, ValueError) as error:
         raise InputError(f"{folder} is no folder of an evaluation ({error}): name one that evaluate wrote") from None
+    lacking = [f"{noise:g}" for noise in noises if not any(folder.glob(f"*/*.noise{noise:g}.safetensors"))]
+    if lacking:
+        raise InputError(f"{folder} has no crops with a noise of {', '.join(lacking)}: name what it has by --noises")
+    return found
 
 
 def _check_crops(folders: list[Export], objects: list[str], noises: tuple[float, ...]) -> None:

@@ -52,6 +52,9 @@ def main(arguments: list[str] | None = None) -> int:
     except (InputError, NotFiniteError) as error:
         print(f"train: {error}", file=sys.stderr)
         return 2 if isinstance(error, InputError) else 1
+    except KeyboardInterrupt:
+        print("train: ended at once, with what was saved last", file=sys.stderr)
+        return 130
     if outcome.reason:
         again = shlex.join([name, *(argument for argument in rest if argument != "--resume"), "--resume"])
         print(

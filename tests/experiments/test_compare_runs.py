@@ -70,3 +70,5 @@ def test_what_cannot_be_compared_is_one_sentence(
         said = capsys.readouterr().err
         assert message in said
         assert said.count("\n") == 1
+    assert run(before, before, noises="0.05") == 2
+    assert "has no crops with a noise of 0.05: name what it has by --noises" in capsys.readouterr().err

@@ -53,6 +53,18 @@ def test_arguments_are_fields(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     assert output.endswith(" --random-seed 7 --max-minutes 5 --folder 'a run' --resume\n")
 
 
+def test_a_second_interrupt_ends_it_with_a_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*arguments: Any, **options: Any) -> Outcome:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("experiments.train.train", interrupted)
+    monkeypatch.setattr("experiments.train.require_made", lambda *folders: None)
+    assert main(["debug"]) == 130
+    assert capsys.readouterr().err == "train: ended at once, with what was saved last\n"
+
+
 def test_names_are_listed_and_guessed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     assert ", ".join(CONFIGS) in capsys.readouterr().out
