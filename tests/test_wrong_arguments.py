@@ -69,6 +69,7 @@ calls = {
     "count is 1.5": lambda: ransac_modes(jax.random.key(0), None, 1.5),
     "config is a str, but must be a IcpConfig": lambda: icp(points, points, np.eye(4), 1.0, config="point_to_point"),
     "config is a str, but must be a DetectConfig": lambda: detection.PoseEstimator.from_pretrained(config="fast"),
+    "config is a dict, but must be a DetectConfig": lambda: detection.PoseEstimator.from_pretrained(config={}),
 }
 for begins, call in calls.items():
     try:

@@ -83,7 +83,7 @@ class PoseEstimator:
         Probabilities are those of the calibration beside the file (NAME.calibration.json); without one, those of the
         released network, and each result says so. Raises InputError if there is no such network.
         """
-        config = config or DetectConfig()
+        config = DetectConfig() if config is None else config
         check_type(config, DetectConfig, "config")
         read_kept()
         path = Path(weights) if Path(weights).suffix == ".safetensors" else released_file(str(weights))

@@ -101,9 +101,8 @@ def pairwise_leaky_sum(
     u: Float[Array, "n c"], v: Float[Array, "k c"], weights: Float[Array, "w c"]
 ) -> Float[Array, "n k"]:
     """Return sum over c of weights_nc leaky(u_nc + v_kc), for leak 0.2; one row of weights is that of all points."""
-    ones = jnp.ones(
-        (u.shape[1], 1), u.dtype
-    )  # XLA's CPU compiler has slow kernels for sums of products, but not for these
+    # XLA's CPU compiler has slow kernels for sums of products, but not for these.
+    ones = jnp.ones((u.shape[1], 1), u.dtype)
     own = jnp.matmul(weights * u, ones, precision=jax.lax.Precision.HIGHEST)
     linear = own + jnp.matmul(weights, v.T, precision=jax.lax.Precision.HIGHEST)
     on_cpu = pairwise_absolute_blocks if weights.shape[0] == 1 else pairwise_absolute_scan
