@@ -33,9 +33,10 @@ from benchmarks.compiled_targets import TARGETS, Target, devices_of, prepare, se
 from benchmarks.compiled_tpu import optimized
 from benchmarks.timing import paused, time_in_turn
 from kmn_jax.errors import InputError
+from kmn_jax.files import check_inputs
 from kmn_jax.geometry import ask_for_fast_selection
 from kmn_jax.platforms import for_any_platform
-from kmn_jax.report import print_table, write_json
+from kmn_jax.report import check_target, print_table, write_json
 
 _NAMED = 5  # of the longest terms of a program
 _REPEATS = 9
@@ -63,6 +64,8 @@ def main(
     """
     if target not in TARGETS:
         raise InputError(f"there is no target {target!r}: choose {', '.join(TARGETS)}")
+    check_inputs(pause)
+    check_target(texts and texts / target / "text")
     where = TARGETS[target]
     if measure:
         ask_for_fast_selection()

@@ -1,4 +1,4 @@
-"""From points to refined poses by the released network: beside Open3D, at growing batches, and a whole bin in one call.
+"""From points to refined poses by a network: beside Open3D, at growing batches, and a whole bin in one call.
 
 python -m benchmarks.crops [--batches 1 4 16 64] [--folder DATASET] [--weights FILE] [--json FILE]
 

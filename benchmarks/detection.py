@@ -9,6 +9,7 @@ repeats: once as it is, and once with the inside of the bin as foreground, as wi
 from __future__ import annotations
 
 import time
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -49,8 +50,11 @@ def main(
     """
     estimator = PoseEstimator.from_pretrained(weights)
     rows = []
+    opened = []
     for folder in folders:
         images = bin_images(folder, split, estimator.model, cards=cards and cards / folder.name)
+        opened.append((folder, chain(list(islice(images, 1)), images)))  # its first, which tells what is wrong with it
+    for folder, images in opened:
         for image in tqdm(images, unit="image", desc=folder.name):
             if len(image.truth) < fewest:
                 continue

@@ -28,7 +28,7 @@ from tqdm import tqdm
 from benchmarks.command import run
 from benchmarks.endurance_frames import Frame, bin_frames, faulty, parts_of, schedule, small_frames
 from kmn_jax.detection import Detections, PoseEstimator
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, require
 from kmn_jax.objects import Part
 from kmn_jax.report import environment, print_table, write_json
 from kmn_jax.units import check_unit
@@ -64,6 +64,7 @@ def main(detections: int = 10_000, hours: float = 1.0, seed: int = 0, json: Path
         seed: number that the order of frames and faults follows from.
         json: where the verdict and what it is made of goes.
     """
+    require(hours > 0, f"--hours is {hours}, but must be above 0")
     random, log = np.random.default_rng(seed), Log()
     estimator = PoseEstimator.from_pretrained()
     with tempfile.TemporaryDirectory(prefix="endurance-") as place:

@@ -18,6 +18,7 @@ import numpy as np
 from benchmarks.command import run
 from benchmarks.network_cases import points_in_order
 from benchmarks.timing import compile_for, time_in_turn
+from kmn_jax.errors import require
 from kmn_jax.geometry import k_nearest, neighbor_graph, squared_distances
 from kmn_jax.report import print_table, write_json
 
@@ -38,6 +39,7 @@ def main(
         repeats: timed rounds.
         json: where results go.
     """
+    require(k <= min(sizes), f"--k is {k}, but there are only {min(sizes)} points in the smallest of --sizes")
     rows = [row for size in sizes for width in widths for row in knn_rows(size, width, k, repeats)]
     print_table(f"{k} nearest neighbours", rows)
     write_json(json, {"knn": rows})

@@ -13,7 +13,7 @@ validation-bins  the 50 validation components in 6 bins each, rendered by ray ca
 worlds       bins, trays and tables of many kinds (`experiments/worlds.py`), of parts made by parameters: four sets to
              fit probabilities on, of which three are also for the pose verifier, and one to test on.
 cad-folder   the pack of all CAD files in and below a folder, of which every tenth is for validation; with
-             `--pack.drops 0` without bins, as configs with worlds need it.
+             `--pack.drops 0` without bins, which is enough for configs with worlds.
 per-object   the pack of one part, for a network of its own: 160 training and 160 validation scenes.
 check        what a pack holds: every file against its checksum, every copy against the walls of its bin.
 small        the few objects and images that the repository carries: `assets/small_pack`, `assets/small_test_set`.
@@ -23,10 +23,12 @@ A build goes on where it stopped, however it stopped; objects that cannot be use
 
 from __future__ import annotations
 
+import json
 import random
 import sys
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
@@ -53,6 +55,7 @@ from experiments.training_parts import PARTS_SEED, TRAINING_FAMILIES
 from experiments.worlds import COMPOUND, TEST, TRAINING, VALIDATION, VERIFIER, Recipe, build_worlds
 from kmn_jax.data import Pack, PackConfig, PackedObject, Record, Source, build_pack
 from kmn_jax.errors import InputError, check_whole
+from kmn_jax.files import write_whole
 from kmn_jax.io import MESH_SUFFIXES
 from kmn_jax.simulate import PERFECT, BinScene, SensorConfig
 
@@ -194,7 +197,8 @@ class CadFolder:
         check_whole(self.every, "every", 2)
         if not self.cad.is_dir():
             raise InputError(f"{self.cad} is not a folder: name the one that holds the CAD files")
-        files = sorted(path for path in self.cad.rglob("*") if path.suffix.lower() in MESH_SUFFIXES)
+        found = (path for path in self.cad.rglob("*") if path.suffix.lower() in MESH_SUFFIXES)
+        files = sorted(path for path in found if path.is_file())
         if len(files) < 2:
             raise InputError(
                 f"{self.cad} holds {len(files)} CAD files ({', '.join(MESH_SUFFIXES)}), but a pack needs one for"
@@ -204,8 +208,22 @@ class CadFolder:
             Source(path.relative_to(self.cad).as_posix(), "train" if row % self.every else "validation", path)
             for row, path in enumerate(files)
         ]
+        _claim(self.folder, sources)
         records = build_pack(self.folder, sources, self.pack, workers=self.workers, retry_rejected=self.retry_rejected)
         print_summary(self.folder, records)
+        for split in ("train", "validation"):
+            if not any(record.entry and record.split == split for record in records):
+                raise InputError(f"{self.folder} has no object for {split}: none of their files could be used")
+
+
+def _claim(folder: Path, sources: list[Source]) -> None:
+    """Write down which files a pack is of. Raises InputError if it is of others, or of other contents or splits."""
+    files = {source.name: [source.split, sha256(source.path.read_bytes()).hexdigest()] for source in sources}
+    text, kept = json.dumps(files, indent=1) + "\n", folder / "sources.json"
+    if (folder / "journal.jsonl").exists() and not (kept.exists() and kept.read_text(encoding="utf-8") == text):
+        raise InputError(f"{folder} holds a pack of other files than these: choose another --folder, or delete it")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(kept, text.encode())
 
 
 @dataclass(frozen=True)

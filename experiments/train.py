@@ -53,7 +53,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"train: {error}", file=sys.stderr)
         return 2 if isinstance(error, InputError) else 1
     except KeyboardInterrupt:
-        print("train: ended at once, with what was saved last", file=sys.stderr)
+        print("train: ended at once; --resume goes on with what was saved, if anything was", file=sys.stderr)
         return 130
     if outcome.reason:
         again = shlex.join([name, *(argument for argument in rest if argument != "--resume"), "--resume"])

@@ -51,7 +51,7 @@ def check_whole(value: object, name: str, low: int, high: int | None = None) -> 
 def check_type(value: object, kind: type, name: str) -> None:
     """Raise InputError unless `value` is one of a class."""
     if not isinstance(value, kind):
-        raise InputError(f"{name} is a {type(value).__name__}, but must be a {kind.__name__}")
+        raise InputError(f"{name} must be of class {kind.__name__}, not {type(value).__name__}")
 
 
 def number_list(text: str, name: str, *counts: int) -> list[float]:

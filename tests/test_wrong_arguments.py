@@ -63,13 +63,13 @@ calls = {
     "num_true is '2'": lambda: average_precision([], [], "2"),
     "threshold is nan": lambda: match_copies([[0.5]], [True], float("nan")),
     "threshold is not an array": lambda: recall(np.ones(3), 1, "x"),
-    "config is a dict, but must be a MatchConfig": lambda: find_matches(*[points] * 6, 1.0, config={"capacity": 9}),
-    "config is a IcpConfig, but must be a RansacConfig": lambda: ransac(jax.random.key(0), None, IcpConfig()),
-    "config is a MatchConfig": lambda: ransac_modes(jax.random.key(0), None, 2, MatchConfig()),
+    "config must be of class MatchConfig, not dict": lambda: find_matches(*[points] * 6, 1.0, config={"capacity": 9}),
+    "config must be of class RansacConfig, not IcpConfig": lambda: ransac(jax.random.key(0), None, IcpConfig()),
+    "config must be of class RansacConfig, not dict": lambda: ransac_modes(jax.random.key(0), None, 2, {}),
     "count is 1.5": lambda: ransac_modes(jax.random.key(0), None, 1.5),
-    "config is a str, but must be a IcpConfig": lambda: icp(points, points, np.eye(4), 1.0, config="point_to_point"),
-    "config is a str, but must be a DetectConfig": lambda: detection.PoseEstimator.from_pretrained(config="fast"),
-    "config is a dict, but must be a DetectConfig": lambda: detection.PoseEstimator.from_pretrained(config={}),
+    "config must be of class IcpConfig, not str": lambda: icp(points, points, np.eye(4), 1.0, config="robust"),
+    "config must be of class DetectConfig, not str": lambda: detection.PoseEstimator.from_pretrained(config="fast"),
+    "config must be of class DetectConfig, not dict": lambda: detection.PoseEstimator.from_pretrained(config={}),
 }
 for begins, call in calls.items():
     try:

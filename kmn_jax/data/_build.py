@@ -75,7 +75,7 @@ def build_pack(
     missing = [path for path in paths if not path.is_file()]
     if missing:
         what = "is a folder, and no CAD file" if missing[0].is_dir() else "is missing"
-        more = f", and {len(missing) - 1} more of {len(paths)} are not there" if len(missing) > 1 else ""
+        more = f", and {len(missing) - 1} more of {len(paths)} cannot be used" if len(missing) > 1 else ""
         raise InputError(f"{missing[0]} {what}{more}: nothing was built")
     wanted = {source.name: source for source in sources}
     if len(wanted) != len(sources):

@@ -16,7 +16,7 @@ def space_filling_order(
     `points[order]` are in order, masked points last; `points[order][places]` are the points again. All but masked
     points must be finite. Points of one of the cube's 1024^3 cells keep their order.
     """
-    order = jnp.argsort(_codes(points, mask))
+    order = jnp.argsort(_codes(points, mask)).astype(jnp.int32)
     return order, jnp.zeros_like(order).at[order].set(jnp.arange(order.shape[0], dtype=order.dtype))
 
 

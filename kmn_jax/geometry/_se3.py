@@ -121,6 +121,5 @@ def random_rotation(key: PRNGKey) -> Rotation:
 def random_pose(key: PRNGKey, translation_scale: Scalar | float = 1.0) -> Pose:
     """Draw a pose with a uniform rotation and a normal translation, whose coordinates have this deviation."""
     rotation_key, translation_key = jax.random.split(key)
-    return from_rotation_translation(
-        random_rotation(rotation_key), translation_scale * jax.random.normal(translation_key, (3,), jnp.float32)
-    )
+    drawn = jax.random.normal(translation_key, (3,), jnp.float32)
+    return from_rotation_translation(random_rotation(rotation_key), jnp.float32(translation_scale) * drawn)

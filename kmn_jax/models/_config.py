@@ -106,7 +106,6 @@ class KeyMatchNetConfig:
             self.num_keypoints <= self.num_object_points,
             f"{self.num_keypoints} keypoints cannot be drawn from {self.num_object_points} object points",
         )
-
         fewest = min(self.num_scene_points, self.num_object_points)
         require(
             self.num_neighbors <= fewest,

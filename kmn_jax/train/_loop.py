@@ -104,12 +104,11 @@ def train(
     # By one process, or the others might find what it has just written.
     from_first_process(lambda: _check_free(folder, resume))
     require(not jax.config.values["jax_enable_x64"], "training is in single precision: turn JAX_ENABLE_X64 off")
-    run = _Run(config, folder, data_mesh(), stop, report or _print)
-    with ExitStack() as held:
+    with stop, ExitStack() as held:
+        run = _Run(config, folder, data_mesh(), stop, report or _print)
         from_first_process(lambda: held.enter_context(only_one(folder)))
         run.restore()
-        with stop:
-            return run.loop(progress)
+        return run.loop(progress)
 
 
 def _check_free(folder: Path, resume: bool) -> None:
@@ -160,8 +159,13 @@ class _Run:
             before = found.facts.get("config", {})
             check_same(self.folder, before, asdict(self.config), _FREE)
             self._take(found)
-            self.report(f"going on at step {self.step} of {self.config.num_steps}")
-            self._check_length(before.get("num_steps", self.config.num_steps))
+            length = self.config.num_steps
+            if self.step > length:
+                raise InputError(
+                    f"num_steps = {length}, but the run in {self.folder} has made {self.step} steps: choose more"
+                )
+            self.report(f"going on at step {self.step} of {length}")
+            self._report_rate(before.get("num_steps", length))
         if self.first:
             check_target(self.folder / "config.json")
             write_config(self.folder, asdict(self.config))
@@ -178,11 +182,9 @@ class _Run:
                 " choose another folder to begin anew"
             )
 
-    def _check_length(self, before: int) -> None:
+    def _report_rate(self, before: int) -> None:
         """Say what another length than before makes of the learning rate, which follows from it."""
         step, length = self.step, self.config.num_steps
-        if step > length:
-            raise InputError(f"num_steps = {length}, but the run in {self.folder} has made {step} steps: choose more")
         if step < length != before:
             rate = self.config.optimizer.rates(before)[min(step, before - 1)]
             self.report(

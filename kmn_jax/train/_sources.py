@@ -100,20 +100,22 @@ def warm_parameters(config: TrainConfig) -> nnx.State | None:
     model = load_model(config.warm_start) if known else load_pretrained(config.warm_start)
     if config.network.inputs == "chiral" and model.config.inputs == "invariant":
         model = with_chiral_inputs(model)
-    theirs = _for_data_of(config.network, model.config)
-    if theirs != config.network:
+    own = trained_network(config)
+    theirs = _fitted_to(own, model.config)
+    if theirs != own:
         raise InputError(
-            f"warm_start = {config.warm_start} is a network with"
-            f" {what_differs(asdict(theirs), asdict(config.network))}: choose the same, or leave it out"
+            f"warm_start = {config.warm_start} is a network with {what_differs(asdict(theirs), asdict(own))}:"
+            " choose the same, or leave it out"
         )
     return model.parameters
 
 
-def _for_data_of(other: KeyMatchNetConfig, config: KeyMatchNetConfig) -> KeyMatchNetConfig:
+def _fitted_to(other: KeyMatchNetConfig, config: KeyMatchNetConfig) -> KeyMatchNetConfig:
     """Return a network's config with what of another's has no parameters, so that its own fit both."""
+    changed = {name: getattr(other, name) for name in _WITHOUT_PARAMETERS}
     if config.object_branch == "learned":  # it has parameters for each keypoint
-        return config
-    return replace(config, **{name: getattr(other, name) for name in _WITHOUT_PARAMETERS})
+        del changed["num_keypoints"]
+    return replace(config, **changed)
 
 
 def _packed_source(

@@ -36,6 +36,12 @@ def test_no_repeats_are_refused(name: str, capsys: pytest.CaptureFixture[str], m
     ("name", "arguments", "reason"),
     [
         ("knn", ["--sizes", "64", "0"], "--sizes is 0"),
+        ("knn", ["--sizes"], "--sizes needs at least one value"),
+        ("knn", ["--sizes", "4096", "64", "--k", "100"], "only 64 points in the smallest of --sizes"),
+        ("endurance", ["--hours", "nan"], "--hours is nan"),
+        ("compiled", ["--pause", "/nonexistent"], "/nonexistent cannot be read"),
+        ("crops", ["--weights", "nosuch"], "there is no released model 'nosuch'"),
+        ("detection", ["--weights", "nosuch"], "there is no released model 'nosuch'"),
         ("pose", ["--inlier-shares", "0.2", "2"], "--inlier-shares has 2.0"),
         ("roofline", ["--training", "nosuch"], "nosuch"),
         ("serve", ["--clients", "0"], "--clients is 0"),
@@ -59,11 +65,13 @@ def test_files_are_tried_first_and_status_and_flags_pass(
 ) -> None:
     called: list[tuple[int, bool, Path | None]] = []
 
-    def main(seed: int = 1, memory: bool = True, json: Path | None = None) -> int:
+    def main(seed: int = 1, memory: bool = True, json: Path | None = None, picture: Path | None = None) -> int:
         called.append((seed, memory, json))
         return 1
 
     assert "cannot write" in said(main, ["--json", str(tmp_path)], capsys, monkeypatch)
+    twice = str(tmp_path / "a.json")
+    assert "to hold another result" in said(main, ["--json", twice, "--picture", twice], capsys, monkeypatch)
     assert not called
     monkeypatch.setattr(sys, "argv", ["benchmark", "--seed", "0", "--no-memory", "--json", str(tmp_path / "a.json")])
     with pytest.raises(SystemExit) as end:

@@ -32,6 +32,11 @@ def test_what_has_fallen_is_measured_again_and_only_that() -> None:
     assert gate.compared(ratios, baseline)[1] == ["slower"]
 
 
+def test_another_processor_is_named() -> None:
+    assert gate.on_another("AMD EPYC", "AMD EPYC") == ""
+    assert "the baseline is of AMD EPYC, this is Intel Xeon" in gate.on_another("AMD EPYC", "Intel Xeon")
+
+
 def test_a_baseline_of_other_pairs_is_refused() -> None:
     with pytest.raises(InputError, match="'b', 'c'"):
         gate.compared({"a": 1.0, "b": 1.0}, {"a": 1.0, "c": 1.0})

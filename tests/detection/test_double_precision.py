@@ -46,6 +46,8 @@ try:
     train(find_config("debug"), "nowhere")
 except InputError as error:
     assert str(error) == "training is in single precision: turn JAX_ENABLE_X64 off", error
+else:
+    raise AssertionError("it trains")
 """
 
 

@@ -85,7 +85,7 @@ def test_extracts_only_what_is_named_from_the_package(tmp_path: Path, monkeypatc
         (["electronics", "--models", "absent"], "error: absent is not a folder"),
         (
             ["electronics", "--models", "experiments"],
-            " is missing, and 1506 more of 1507 are not there: nothing was built",
+            " is missing, and 1506 more of 1507 cannot be used: nothing was built",
         ),
         (["per-object", "--cad", "experiments"], "experiments is a folder, and no CAD file: nothing was built"),
         (["cad-folder", "--cad", "README.md"], "README.md is not a folder"),
@@ -259,10 +259,23 @@ def test_packs_are_made_of_ones_own_files(tmp_path: Path) -> None:
     for name, source in (("b.stl", "screw"), ("more/c.STL", "gear_motor"), ("a.stl", "screw")):
         shutil.copy(assets / f"{source}.stl", cad / name)
     (cad / "notes.txt").touch()
-    build_data.CadFolder(cad, tmp_path / "pack", every=2, workers=1, pack=PackConfig(drops=0)).run()
+    (cad / "folder.stl").mkdir()
+    own = build_data.CadFolder(cad, tmp_path / "pack", every=2, workers=1, pack=PackConfig(drops=0))
+    own.run()
     pack = Pack(tmp_path / "pack")
     assert (pack.names("validation"), pack.names("train")) == (["a.stl", "more/c.STL"], ["b.stl"])
     assert not pack.problems()
+    own.run()  # goes on
+    for change in (
+        lambda: (cad / "b.stl").write_bytes((cad / "more" / "c.STL").read_bytes()),
+        lambda: (cad / "b.stl").unlink(),
+    ):
+        change()
+        with pytest.raises(InputError, match="holds a pack of other files than these: choose another --folder"):
+            own.run()
+    (cad / "a.stl").write_bytes(b"broken")
+    with pytest.raises(InputError, match="has no object for validation: none of their files could be used"):
+        replace(own, folder=tmp_path / "other").run()
 
 
 def test_surfels_are_of_components_and_of_parts_made_by_parameters(

@@ -62,7 +62,7 @@ def test_a_second_interrupt_ends_it_with_a_sentence(
     monkeypatch.setattr("experiments.train.train", interrupted)
     monkeypatch.setattr("experiments.train.require_made", lambda *folders: None)
     assert main(["debug"]) == 130
-    assert capsys.readouterr().err == "train: ended at once, with what was saved last\n"
+    assert capsys.readouterr().err == "train: ended at once; --resume goes on with what was saved, if anything was\n"
 
 
 def test_names_are_listed_and_guessed(capsys: pytest.CaptureFixture[str]) -> None:
