@@ -292,9 +292,10 @@ def test_an_interrupt_ends_what_python_would_wait_for(is_busy: bool) -> None:
     """The child is in a call that returns to Python after minutes, as compiling does, or a thread of it is."""
     call = "long()" if is_busy else "threading.Thread(target=long).start(); time.sleep(300)"
     code = (
-        "import hashlib, sys, threading, time\n"
+        "import hashlib, signal, sys, threading, time\n"
         "from kmn_jax.programs import ended_by_interrupt\n"
         "def long(): hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1)\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored where tests run in the background
         "try:\n"
         "    with ended_by_interrupt():\n"
         "        print('waits', flush=True)\n"
@@ -316,11 +317,12 @@ def test_interrupts_are_as_before_where_they_are_ignored_and_in_other_threads() 
             return before > outside
 
     outside = threading.active_count()
-    assert watched()
-    while threading.active_count() > outside:  # until the thread that watched has ended
-        time.sleep(0.02)
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
+        assert watched()
+        while threading.active_count() > outside:  # until the thread that watched has ended
+            time.sleep(0.02)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         assert not watched()
     finally:
         signal.signal(signal.SIGINT, before)

@@ -118,7 +118,7 @@ def test_frames_in_which_nothing_is_found_get_no_faults(
     assert (log.faults.total(), log.untold, log.differing) == (0, [], [])
 
 
-@pytest.mark.parametrize("run", [endurance.main, attack.main, kills.main])
+@pytest.mark.parametrize("run", [attack.main, kills.main])
 def test_a_place_for_results_is_made_before_what_takes_time(run: Callable[..., int], tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(InputError, match="cannot make the folder"):

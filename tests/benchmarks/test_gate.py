@@ -32,9 +32,12 @@ def test_what_has_fallen_is_measured_again_and_only_that() -> None:
     assert gate.compared(ratios, baseline)[1] == ["slower"]
 
 
-def test_another_processor_is_named() -> None:
-    assert gate.on_another("AMD EPYC", "AMD EPYC") == ""
-    assert "the baseline is of AMD EPYC, this is Intel Xeon" in gate.on_another("AMD EPYC", "Intel Xeon")
+def test_a_processor_is_compared_with_itself_or_with_the_lowest() -> None:
+    found = {"one": {"a": 3.0, "b": 1.5}, "other": {"a": 2.0, "b": 2.5}}
+    assert gate.baseline_for("one", found) == (found["one"], "one")
+    lowest, of = gate.baseline_for("third", found)
+    assert lowest == {"a": 2.0, "b": 1.5}
+    assert of == "other processors (one, other), the lowest of each, as third has none"
 
 
 def test_a_baseline_of_other_pairs_is_refused() -> None:
@@ -42,10 +45,13 @@ def test_a_baseline_of_other_pairs_is_refused() -> None:
         gate.compared({"a": 1.0, "b": 1.0}, {"a": 1.0, "c": 1.0})
 
 
-def test_the_committed_baseline_says_where_it_is_from() -> None:
-    found = json.loads(gate.BASELINE.read_text(encoding="utf-8"))
-    assert all(ratio > 1 for ratio in found["ratios"].values())
-    assert found["environment"]["platform"] == "cpu"
+def test_committed_baselines_say_where_they_are_from() -> None:
+    files = [json.loads(path.read_text(encoding="utf-8")) for path in gate.BASELINES.glob("*.json")]
+    assert {file["environment"]["platform"] for file in files} == {"cpu"}
+    found = gate.read_baselines(gate.BASELINES)
+    assert len(found) == len(files) > 1
+    assert len({frozenset(ratios) for ratios in found.values()}) == 1
+    assert all(ratio > 1 for ratios in found.values() for ratio in ratios.values())
 
 
 @jax.numpy_rank_promotion("allow")  # the dense reference is written plainly

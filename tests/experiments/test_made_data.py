@@ -74,7 +74,8 @@ def test_so_is_it_by_measurements_of_whole_bins_and_comparisons(
 def test_a_benchmark_without_data_is_one_sentence() -> None:
     command = [sys.executable, "-m", "benchmarks.detection", "--folders", "outputs/test_sets/none"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=200)
-    assert done.returncode == 1
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ")
     assert "python -m experiments.build_data test-sets" in done.stderr
     assert "Traceback" not in done.stderr
 
