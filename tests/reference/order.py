@@ -36,6 +36,7 @@ LONGEST = (
     "viz/test_viewer.py",
     "viz/test_viewer_panel.py",
     "experiments/test_build_data.py",
+    "detection/test_double_precision.py",
     "experiments/test_versions.py",
     "experiments/test_worlds.py",
     "objects/test_symmetry.py",
