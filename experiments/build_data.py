@@ -57,6 +57,7 @@ from kmn_jax.data import Pack, PackConfig, PackedObject, Record, Source, build_p
 from kmn_jax.errors import InputError, check_whole
 from kmn_jax.files import write_whole
 from kmn_jax.io import MESH_SUFFIXES
+from kmn_jax.report import check_target
 from kmn_jax.simulate import PERFECT, BinScene, SensorConfig
 
 OUTPUTS = Path("outputs")
@@ -218,11 +219,14 @@ class CadFolder:
 
 def _claim(folder: Path, sources: list[Source]) -> None:
     """Write down which files a pack is of. Raises InputError if it is of others, or of other contents or splits."""
-    files = {source.name: [source.split, sha256(source.path.read_bytes()).hexdigest()] for source in sources}
+    try:
+        files = {source.name: [source.split, sha256(source.path.read_bytes()).hexdigest()] for source in sources}
+    except OSError as error:
+        raise InputError(f"{error.filename} cannot be read: {error.strerror}") from None
     text, kept = json.dumps(files, indent=1) + "\n", folder / "sources.json"
     if (folder / "journal.jsonl").exists() and not (kept.exists() and kept.read_text(encoding="utf-8") == text):
         raise InputError(f"{folder} holds a pack of other files than these: choose another --folder, or delete it")
-    folder.mkdir(parents=True, exist_ok=True)
+    check_target(kept)
     write_whole(kept, text.encode())
 
 
