@@ -10,7 +10,6 @@ from typing import Any, NoReturn
 import tyro
 
 from kmn_jax.errors import InputError, check_whole, require
-from kmn_jax.files import check_outputs
 from kmn_jax.report import check_target
 
 _FILES = ("json", "picture")  # what flags of files that are written are called
@@ -26,10 +25,7 @@ def run(main: Callable[..., Any]) -> NoReturn:
 
     @functools.wraps(main)
     def checked(**given: Any) -> Any:
-        files = [given[name] for name in _FILES if name in given]
-        for file in files:
-            check_target(file)
-        check_outputs(files)
+        check_target(*(given[name] for name in _FILES if name in given))
         for name, value in given.items():
             flag = f"--{name.replace('_', '-')}"
             require(value != () or name in _MAY_BE_EMPTY, f"{flag} needs at least one value")

@@ -23,7 +23,6 @@ A build goes on where it stopped, however it stopped; objects that cannot be use
 
 from __future__ import annotations
 
-import json
 import random
 import sys
 from collections import Counter
@@ -44,6 +43,7 @@ from experiments.test_sets import (
     CONFIG,
     VALIDATION_CONFIG,
     build_test_set,
+    claim,
     electronics_sources,
     industrial_sources,
     is_unexplained,
@@ -55,9 +55,7 @@ from experiments.training_parts import PARTS_SEED, TRAINING_FAMILIES
 from experiments.worlds import COMPOUND, TEST, TRAINING, VALIDATION, VERIFIER, Recipe, build_worlds
 from kmn_jax.data import Pack, PackConfig, PackedObject, Record, Source, build_pack
 from kmn_jax.errors import InputError, check_whole
-from kmn_jax.files import write_whole
 from kmn_jax.io import MESH_SUFFIXES
-from kmn_jax.report import check_target
 from kmn_jax.simulate import PERFECT, BinScene, SensorConfig
 
 OUTPUTS = Path("outputs")
@@ -209,7 +207,7 @@ class CadFolder:
             Source(path.relative_to(self.cad).as_posix(), "train" if row % self.every else "validation", path)
             for row, path in enumerate(files)
         ]
-        _claim(self.folder, sources)
+        claim(self.folder, _contents(sources), "journal.jsonl", "a pack of other files than these")
         records = build_pack(self.folder, sources, self.pack, workers=self.workers, retry_rejected=self.retry_rejected)
         print_summary(self.folder, records)
         for split in ("train", "validation"):
@@ -217,17 +215,12 @@ class CadFolder:
                 raise InputError(f"{self.folder} has no object for {split}: none of their files could be used")
 
 
-def _claim(folder: Path, sources: list[Source]) -> None:
-    """Write down which files a pack is of. Raises InputError if it is of others, or of other contents or splits."""
+def _contents(sources: list[Source]) -> dict[str, list[str]]:
+    """Return split and digest of each file by its name. Raises InputError if one cannot be read."""
     try:
-        files = {source.name: [source.split, sha256(source.path.read_bytes()).hexdigest()] for source in sources}
+        return {source.name: [source.split, sha256(source.path.read_bytes()).hexdigest()] for source in sources}
     except OSError as error:
         raise InputError(f"{error.filename} cannot be read: {error.strerror}") from None
-    text, kept = json.dumps(files, indent=1) + "\n", folder / "sources.json"
-    if (folder / "journal.jsonl").exists() and not (kept.exists() and kept.read_text(encoding="utf-8") == text):
-        raise InputError(f"{folder} holds a pack of other files than these: choose another --folder, or delete it")
-    check_target(kept)
-    write_whole(kept, text.encode())
 
 
 @dataclass(frozen=True)

@@ -60,8 +60,7 @@ def calibrate(options: Options) -> dict[str, Any]:
     if options.judge_anew and (options.candidates is None or not options.candidates.exists()):
         raise InputError("there are no poses to judge anew: name a file of them by --candidates")
     output = options.output or (SHIPPED if options.model is None else calibration_beside(options.model))
-    for target in (output, options.candidates, options.json, options.picture):
-        check_target(target)
+    check_target(output, options.candidates, options.json, options.picture)
     load_lightgbm()  # before an hour of searching, not after
     network = load_pretrained() if options.model is None else load_model(options.model)
     poses = poses_to_fit(options, options, network, options.candidates)

@@ -182,8 +182,7 @@ class Tally:
 
 def run(options: Options) -> dict[str, Any]:
     """Detect, print and return the numbers."""
-    for target in (options.json, options.picture):
-        check_target(target)
+    check_target(options.json, options.picture)
     unknown = [name for name in options.methods if name not in METHODS]
     if unknown:
         raise InputError(f"method {unknown[0]!r} is not known: choose among {', '.join(METHODS)}")

@@ -118,8 +118,7 @@ def scan_of(image: WorldImage, given: Literal["images", "clouds", "cut-outs"]) -
 
 def run(options: Options) -> dict[str, Any]:
     """Detect, print and return the numbers."""
-    for target in (options.json, options.picture, options.worst and options.worst / "worst.png"):
-        check_target(target)
+    check_target(options.json, options.picture, options.worst and options.worst / "worst.png")
     model = load_pretrained() if options.model is None else load_model(options.model)
     fitted = load_probabilities(options.calibration, EVIDENCE)
     tallies: dict[str, WorldTally] = defaultdict(WorldTally)

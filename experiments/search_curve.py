@@ -70,8 +70,7 @@ class Options:
 
 def run(options: Options) -> list[dict[str, Any]]:
     """Search, print and return a row for each setting."""
-    for target in (options.json, options.picture):
-        check_target(target)
+    check_target(options.json, options.picture)
     unknown = [name for name in options.settings if name not in SETTINGS]
     if unknown or PLAIN not in options.settings:
         wrong = (

@@ -91,17 +91,18 @@ def write_scenes(
     write_camera(folder, frame.camera, finest_depth_scale(float(frame.depth.max()), "mm"))
 
 
-def claim(folder: Path, recipe: dict[str, Any]) -> None:
+def claim(folder: Path, recipe: dict[str, Any], made: str = SPLIT, what: str = "a test set of another recipe") -> None:
     """Make the folder, or see that what it holds is of the same recipe; the recipe's file is hidden from digests.
 
-    Raises InputError if the folder cannot be written to or holds a set of another recipe.
+    It holds something if `made` is in it. Raises InputError, which says `what`, if that is of another recipe, and if
+    the folder cannot be written to.
     """
     text = json.dumps(recipe, indent=1) + "\n"
     file = folder / ".recipe.json"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if (folder / SPLIT).exists() and (not file.exists() or file.read_text(encoding="utf-8") != text):
-            raise InputError(f"{folder} holds a test set of another recipe: choose another folder, or delete it")
+        if (folder / made).exists() and (not file.exists() or file.read_text(encoding="utf-8") != text):
+            raise InputError(f"{folder} holds {what}: choose another folder, or delete it")
     except OSError as error:
         raise InputError(f"{folder} cannot be written to: {error.strerror}") from None
     write_whole(file, text.encode())

@@ -83,8 +83,7 @@ class State(NamedTuple):
 
 def train_verifier(options: Options) -> dict[str, Any]:
     """Train, write and print. Raises InputError if there is nothing to learn from."""
-    for target in (options.output, options.json):
-        check_target(target)
+    check_target(options.output, options.json)
     network = load_pretrained()
     poses = told(read_poses(options.candidates, options, options, network)[0])
     require(bool(poses["known"].any()), f"{options.candidates} holds no poses of known worlds: see --known-worlds")

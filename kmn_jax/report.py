@@ -68,18 +68,19 @@ def write_json(path: Path | None, results: Mapping[str, Any]) -> None:
     print(f"\nwrote {path}")
 
 
-def check_target(path: Path | None) -> None:
-    """Make the folder of a file that is to be written; call it before what takes time.
+def check_target(*paths: Path | None) -> None:
+    """Make the folders of files that are to be written; call it before what takes time.
 
-    Raises InputError if the file cannot be written.
+    Raises InputError if a file cannot be written, or is to hold two results.
     """
-    if path is None:
-        return
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot make the folder {path.parent}: {error.strerror}") from None
-    check_outputs((path,))
+    for path in paths:
+        if path is None:
+            continue
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot make the folder {path.parent}: {error.strerror}") from None
+    check_outputs(paths)
 
 
 def _plain(value: Any) -> Any:

@@ -160,10 +160,10 @@ class _Run:
             check_same(self.folder, before, asdict(self.config), _FREE)
             self._take(found)
             length = self.config.num_steps
-            if self.step > length:
-                raise InputError(
-                    f"num_steps = {length}, but the run in {self.folder} has made {self.step} steps: choose more"
-                )
+            require(
+                self.step <= length,
+                f"num_steps = {length}, but the run in {self.folder} has made {self.step} steps: choose more",
+            )
             self.report(f"going on at step {self.step} of {length}")
             self._report_rate(before.get("num_steps", length))
         if self.first:

@@ -90,7 +90,7 @@ def test_extracts_only_what_is_named_from_the_package(tmp_path: Path, monkeypatc
         (["per-object", "--cad", "experiments"], "experiments is a folder, and no CAD file: nothing was built"),
         (["cad-folder", "--cad", "README.md"], "README.md is not a folder"),
         (["cad-folder", "--cad", "docs"], "docs holds 0 CAD files (.stl, "),
-        (["cad-folder", "--cad", "experiments/assets", "--folder", "/proc/x"], "cannot make the folder /proc/x"),
+        (["cad-folder", "--cad", "experiments/assets", "--folder", "/proc/x"], "/proc/x cannot be written to: "),
         (["cad-folder", "--cad", "docs", "--every", "1"], "every is 1, but must be a whole number of 2 or more"),
         (["electronics", "--models", "experiments", "--limit", "0"], "limit = 0 must be 1 or more"),
         (["electronics", "--pack.drops", "-1"], "drops = -1 must be 0 or more"),
@@ -272,7 +272,9 @@ def test_packs_are_made_of_ones_own_files(tmp_path: Path) -> None:
         lambda: (cad / "b.stl").unlink(),
     ):
         change()
-        with pytest.raises(InputError, match="holds a pack of other files than these: choose another --folder"):
+        with pytest.raises(
+            InputError, match="holds a pack of other files than these: choose another folder, or delete it"
+        ):
             own.run()
     (cad / "a.stl").write_bytes(b"broken")
     with pytest.raises(InputError, match="has no object for validation: none of their files could be used"):
