@@ -10,7 +10,7 @@ from functools import partial
 from io import BytesIO
 from pathlib import Path
 from threading import Lock
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 from zipfile import BadZipFile
 
 import numpy as np
@@ -60,6 +60,8 @@ _COLUMNS = (  # of what is stored
 _HOW = 8  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
 _IN_MEMORY = 600  # searches, of each of which what was found first, crops and all, takes 10 MB
 _AT_ONCE = 2  # searches: one alone leaves a part of two cores idle
+_Item = TypeVar("_Item")
+_Made = TypeVar("_Made")
 _READING = Lock()  # NumPy parses the headers of arrays, which CPython 3.11 sometimes refuses two threads at once
 
 
@@ -93,7 +95,7 @@ def poses_to_fit(sources: Sources, fits: FitOptions, network: Model, stored: Pat
     if stored is not None:
         made_of = _made_of(sources, fits, network)
         of = {"made_of": made_of, "names": names, "used": EVIDENCE}  # used: for what is reported
-        _write(stored, poses | {key: np.array(value) for key, value in of.items()})
+        write_columns(stored, poses | {key: np.array(value) for key, value in of.items()})
     return told(poses | {"evidence": poses["evidence"][:, : len(EVIDENCE)]})
 
 
@@ -106,14 +108,15 @@ def read_poses(
     """
     if not stored.is_file():
         raise InputError(f"{stored} does not exist: python -m experiments.calibrate --candidates makes it")
-    poses = _loaded(stored)
+    poses = read_columns(stored)
     if str(poses.pop("made_of", "")) != _made_of(sources, fits, network) or set(poses) != {*_COLUMNS, "names", "used"}:
         raise InputError(f"{stored} holds poses of other bins, weights or settings: remove it")
     names, used = (tuple(poses.pop(key).tolist()) for key in ("names", "used"))
     return poses, names, used
 
 
-def _loaded(path: Path) -> Columns:
+def read_columns(path: Path) -> Columns:
+    """Read what `write_columns` wrote. Raises InputError if that is damaged."""
     try:
         with _READING, np.load(path) as file:
             return dict(file)
@@ -121,7 +124,8 @@ def _loaded(path: Path) -> Columns:
         raise InputError(f"{path} holds no poses ({shown(error)}): remove it") from None
 
 
-def _write(path: Path, columns: Columns) -> None:
+def write_columns(path: Path, columns: Columns) -> None:
+    """Write columns of poses to a file that appears whole."""
     written = BytesIO()
     np.savez(written, **cast(dict[str, Any], columns))
     write_whole(path, written.getvalue())
@@ -151,7 +155,7 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
             first[search.row] = found
         return search.columns(found)
 
-    found_parts = _side_by_side(partial(kept.made, "found", found_first), searches(sources, network), at_once)
+    found_parts = side_by_side(partial(kept.made, "found", found_first), searches(sources, network), at_once)
     poses = _joined(found_parts)
     none = np.zeros(len(poses["error"]), dtype=bool)
     poses |= {"refined": none, "due": none, "reported": none}
@@ -176,7 +180,7 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
         return found
 
     unknown = replace(sources, known_worlds=())  # whose searches come last: the others stay in their rows
-    more = _joined(_side_by_side(refined_part, searches(unknown, network), at_once))
+    more = _joined(side_by_side(refined_part, searches(unknown, network), at_once))
     none = np.zeros(len(more["error"]), dtype=bool)
     return _with_reported(_joined([poses, more | {"refined": ~none, "reported": none}]), searched, fits)
 
@@ -199,24 +203,22 @@ class _Kept:
         """Return what a stage makes of a search, or made of it before; nothing of one that is empty."""
         path = self._folder and self._folder / f"{search.name}-{stage}.npz"
         if path and path.exists():
-            columns = _loaded(path)
+            columns = read_columns(path)
         elif search.is_empty:
             return {}
         else:
             columns = make(search)
             if path:
-                _write(path, columns)
+                write_columns(path, columns)
         # Row and number may be others today.
         of_search = {"search": search.row, "object": search.number, "known": search.is_known}
         return columns | {name: np.full(len(columns["error"]), value) for name, value in of_search.items()}
 
 
-def _side_by_side(
-    function: Callable[[Search], Columns], items: Iterable[Search], at_once: int = _AT_ONCE
-) -> list[Columns]:
+def side_by_side(function: Callable[[_Item], _Made], items: Iterable[_Item], at_once: int = _AT_ONCE) -> list[_Made]:
     """Return what a function makes of items, some of which it is given at once."""
-    results: list[Columns] = []
-    running: deque[Future[Columns]] = deque()
+    results: list[_Made] = []
+    running: deque[Future[_Made]] = deque()
     with ThreadPoolExecutor(at_once) as pool:
         try:
             for item in items:
@@ -239,23 +241,37 @@ def _due(
 
 
 def judged_anew(poses: Columns, names: tuple[str, ...], sources: Sources, fits: FitOptions, network: Model) -> Columns:
-    """Return poses with the evidence of today: what comes of crops is what they have, by `names`, the rest computed.
+    """Return poses with the evidence of today: what they have, by `names`, and what they lack of depth images computed.
 
-    Raises InputError if the images are not those that the poses were found in.
+    All of that is computed where it is wanted anew. Raises InputError if the images are not those that the poses were
+    found in.
     """
     evidence = np.zeros((len(poses["evidence"]), len(EVIDENCE)), dtype=np.float32)
+    of_images = {*PICTURE_EVIDENCE, VERIFIED}
+    made = of_images if sources.judge_anew else of_images - set(names)
     for column, name in enumerate(EVIDENCE):
-        if name not in (*PICTURE_EVIDENCE, VERIFIED):
+        if name not in made:
             evidence[:, column] = poses["evidence"][:, names.index(name)]
+    config = DetectConfig().search_of(network.config)
+    searched: dict[int, DevicePart] = {}
+    all_of_picture = not made.isdisjoint(PICTURE_EVIDENCE)
     of_picture = np.array([EVIDENCE.index(name) for name in PICTURE_EVIDENCE])
-    config, searched = DetectConfig().search_of(network.config), {}
-    for search, rows in searches_of(poses, sources, network):
+
+    def judge(item: tuple[Search, Int[np.ndarray, " k"]]) -> None:
+        search, rows = item
+        rows, given = judged[rows], (search.on_device, search.scene)
         searched[search.row] = search.on_device
-        given = search.on_device, search.scene
-        seen = picture_evidence(poses["T_camera_object"][rows], *given, config.agreement)
-        evidence[np.ix_(rows, of_picture)] = seen
+        if all_of_picture:
+            seen = picture_evidence(poses["T_camera_object"][rows], *given, config.agreement)
+            evidence[np.ix_(rows, of_picture)] = seen
         refined = rows[poses["refined"][rows]]
-        evidence[refined, EVIDENCE.index(VERIFIED)] = verified(poses["T_camera_object"][refined], *given)
+        if VERIFIED in made:
+            evidence[refined, EVIDENCE.index(VERIFIED)] = verified(poses["T_camera_object"][refined], *given)
+
+    # Verifiers say something of refined poses alone, of which there are none of known parts.
+    judged = np.flatnonzero(all_of_picture | poses["refined"])
+    sources = sources if all_of_picture else replace(sources, known_worlds=())
+    side_by_side(judge, searches_of({name: values[judged] for name, values in poses.items()}, sources, network))
     return _with_reported(poses | {"evidence": evidence}, searched, fits)
 
 

@@ -3,8 +3,9 @@
 It learns which poses are right from those that `python -m experiments.calibrate --candidates FILE` has found in known
 worlds, once they are moved onto the depth image, as those that it is shown are; name FILE, images and worlds as there.
 How it does on the refined poses of all other images, to which probabilities are fitted, is told, and nothing is chosen
-by it. Afterwards raise the number of `kmn_jax.detection.VERIFIED`, and fit again by the same FILE, whose poses are
-judged anew.
+by it. What verifiers are shown of all poses takes an hour, and gigabytes of a folder beside FILE: what was ended goes
+on where it was until the network itself is trained, in half an hour. Afterwards raise the number of
+`kmn_jax.detection.VERIFIED`, and fit again by the same FILE, whose poses are judged anew.
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ from jaxtyping import Array, Bool, Float, Float16, Int
 from tqdm import tqdm
 
 from experiments.bins import THRESHOLD
-from experiments.candidates import read_poses, searches_of
+from experiments.candidates import read_columns, read_poses, searches_of, side_by_side, write_columns
 from experiments.detect_bins import PRECISION, Tally
 from experiments.fits import FitOptions, told, weights_of
-from experiments.searches import Columns, Sources
+from experiments.searches import Columns, Search, Sources
 from kmn_jax.detection import PREDICTED_CHANNELS, VERIFIER_SIDE, call_rows, polish, verifier_cells
 from kmn_jax.errors import InputError, require
 from kmn_jax.files import write_whole
@@ -50,6 +51,7 @@ from kmn_jax.train import OptimizerConfig
 from kmn_jax.typing import PRNGKey, Scalar
 
 _AT_ONCE = 256  # poses that are verified
+_SHOWN = 1  # version of what verifiers are shown: it goes up with `verifier_cells` and `polish`
 _LEAST_RATE = 1e-6
 _SPOILED = 1 / 6, 1 / 2  # of a picture's sides, what is spoiled of it
 
@@ -83,7 +85,8 @@ class State(NamedTuple):
 
 def train_verifier(options: Options) -> dict[str, Any]:
     """Train, write and print. Raises InputError if there is nothing to learn from."""
-    check_target(options.output, options.json)
+    for target in (options.output, options.json):
+        check_target(target)
     network = load_pretrained()
     poses = told(read_poses(options.candidates, options, options, network)[0])
     require(bool(poses["known"].any()), f"{options.candidates} holds no poses of known worlds: see --known-worlds")
@@ -112,18 +115,31 @@ def _seen(
     """Return what a verifier sees of each pose, and by how much it is off; those of known parts are polished before."""
     cells = np.empty((len(poses["error"]), VERIFIER_SIDE, VERIFIER_SIDE, VERIFIER_CHANNELS), dtype=np.float16)
     errors = poses["error"].copy()
-    for search, rows in searches_of(poses, options, network):
-        part, image, moved = search.on_device, search.scene.image, poses["T_camera_object"][rows]
-        if search.is_known:
-            moved = polish(moved, part, image)
-            errors[rows] = search.errors(moved, search.image.errors)
-        given = part.surfels, image, part.arrays.diameter
-        cells[rows] = call_rows(
-            lambda pose, given=given: _cells(pose, *given),
-            lambda poses, given=given: _cells_of_many(poses, *given),
-            moved,
-        )
+    folder = options.candidates.with_name(f"{options.candidates.name}.shown_{_SHOWN}")
+    folder.mkdir(exist_ok=True)
+
+    def see(item: tuple[Search, Int[np.ndarray, " k"]]) -> None:
+        search, rows = item
+        path, given = folder / f"{search.name}.npz", poses["T_camera_object"][rows]
+        seen = read_columns(path) if path.exists() else {}
+        if not seen or not np.array_equal(seen["given"], given):  # other poses were found by another FILE
+            seen = {"given": given} | _seen_in(search, given, errors[rows])
+            write_columns(path, seen)
+        cells[rows], errors[rows] = seen["cells"], seen["errors"]
+
+    side_by_side(see, searches_of(poses, options, network))
     return cells, errors
+
+
+def _seen_in(search: Search, poses: Float[np.ndarray, "k 4 4"], errors: Float[np.ndarray, " k"]) -> Columns:
+    """Return what is seen of the poses of one search, as columns."""
+    part, image = search.on_device, search.scene.image
+    if search.is_known:
+        poses = polish(poses, part, image)
+        errors = search.errors(poses, search.image.errors)
+    given = part.surfels, image, part.arrays.diameter
+    cells = call_rows(lambda pose: _cells(pose, *given), lambda many: _cells_of_many(many, *given), poses)
+    return {"cells": cells.astype(np.float16), "errors": errors}
 
 
 _cells = jax.jit(verifier_cells)

@@ -101,14 +101,13 @@ def float_array(
     *,
     mask: jax.Array | None = None,
     finite: bool = True,
-    integers: bool = False,
 ) -> jax.Array:
     """Return `value` as a floating JAX array of `shape` (None = any length), or raise InputError.
 
     Rows where `mask` is false are padding and may hold anything; `finite` false allows infinity and NaN
-    everywhere, `integers` true takes whole numbers, too. Float64 becomes the default float type.
+    everywhere. Whole numbers are taken as such; they and float64 become the default float type.
     """
-    array = _array(_as_fractions(value, name) if integers else value, name, shape)
+    array = _array(_as_fractions(value, name), name, shape)
     if not jnp.issubdtype(array.dtype, jnp.floating):
         raise InputError(f"{name} has dtype {array.dtype}, but must be floating point: convert it to float32")
     if finite and not is_traced(array) and not is_traced(mask) and not _is_finite(array, mask):
@@ -204,7 +203,7 @@ def index_array(value: ArrayInput, name: str, length: int | None, upper: int) ->
 
 def positive_scalar(value: ArrayInput, name: str) -> jax.Array:
     """Return a finite float scalar above zero."""
-    array = float_array(value, name, (), integers=True)
+    array = float_array(value, name, ())
     if not is_traced(array) and not float(array) > 0:
         raise InputError(f"{name} is {float(array):g}, but must be above zero")
     return array
@@ -212,7 +211,7 @@ def positive_scalar(value: ArrayInput, name: str) -> jax.Array:
 
 def rigid_pose(value: ArrayInput, name: str) -> jax.Array:
     """Return a (4, 4) matrix of a proper rotation and a translation, to the digits that pose files carry."""
-    array = float_array(value, name, (4, 4), integers=True)
+    array = float_array(value, name, (4, 4))
     if not is_traced(array):
         matrix = np.asarray(array, dtype=np.float64)
         rotation, last_row = matrix[:3, :3], matrix[3]

@@ -16,10 +16,19 @@ def test_what_is_an_array_is_taken(value: object) -> None:
     assert float_array(value, "x", (None, 2)).shape == (1, 2)
 
 
+@pytest.mark.parametrize("kind", [list, np.int64, np.uint8, jnp.int16])
+def test_whole_numbers_are_taken_for_fractions(kind: Any) -> None:
+    value = [[1, 200]] if kind is list else np.array([[1, 100]]).astype(kind)
+    array = float_array(value, "x", (None, 2))
+    assert array.dtype == jnp.float32
+    np.testing.assert_array_equal(array, value)
+    assert jax.jit(lambda: float_array(value, "x", (None, 2)))().dtype == jnp.float32
+
+
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ([[1, 2]], "floating point"),
+        ([[True, False]], "floating point"),
         (np.ones((1, 2), complex), "floating point"),
         ([[1.0, 2.0], [3.0]], "not an array"),
         ("text", "not an array of numbers"),

@@ -140,7 +140,7 @@ class PoseEstimator:
                 f"background is a {type(options).__name__}, but must be ForegroundOptions: an empty bin is theirs"
             )
         if sensor is not None:
-            float_array(sensor, "sensor", (3,), integers=True)
+            float_array(sensor, "sensor", (3,))
             sensor = np.asarray(sensor, dtype=np.float64)
         given = arranged(scan, K, depth_unit, camera, unit)
         read, truth, bop_ids = read_source(given, unit, camera, smallest)

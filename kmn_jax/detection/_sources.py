@@ -141,7 +141,7 @@ def places_of(at: ArrayInput | None) -> Float[np.ndarray, "k 3"] | None:
         return None
     row_count(at, "at")
     rows = np.atleast_2d(np.asarray(at))
-    float_array(rows, "at", (None, 3), integers=True)
+    float_array(rows, "at", (None, 3))
     return rows.astype(np.float64)
 
 
@@ -184,4 +184,8 @@ def read_source(
     real = np.isfinite(single).all(axis=1) & (single != 0).any(axis=1)
     if not real.any():
         raise InputError(f"none of the scan's {len(single)} points was measured: all are NaN, infinite or zero")
-    return Scan(held(np.asarray(source)[real]), None, None, None, resolve_unit(asked, part.unit)), None, nothing
+    return (
+        Scan(held(np.asarray(source, dtype=np.float64)[real]), None, None, None, resolve_unit(asked, part.unit)),
+        None,
+        nothing,
+    )

@@ -31,11 +31,11 @@ def symmetric_pose_error(
     for wrong shapes, poses that are not rigid and no symmetry at all.
     """
     poses = [rigid_pose(T_estimated, "T_estimated"), rigid_pose(T_true, "T_true")]
-    rotations = float_array(rotations, "rotations", (None, 3, 3), integers=True)
+    rotations = float_array(rotations, "rotations", (None, 3, 3))
     if len(rotations) == 0:
         raise InputError("rotations is empty, but the identity is a symmetry of every object")
-    axes = float_array(axes, "axes", (None, 3), integers=True)
-    place = float_array(center, "center", (3,), integers=True)
+    axes = float_array(axes, "axes", (None, 3))
+    place = float_array(center, "center", (3,))
     if not any(map(is_traced, (*poses, place))):
         given = (np.asarray(value, dtype=np.float64) for value in (T_estimated, T_true, center))
         poses = [jnp.asarray(pose) for pose in about_the_object(*given)]
@@ -114,7 +114,7 @@ def average_precision(scores: ArrayInput, right: ArrayInput, num_true: int) -> f
     none is so high. `num_true` is how many there are to find. Raises InputError if there are none, or fewer than are
     right, for wrong shapes and for scores that are not finite.
     """
-    count = len(float_array(scores, "scores", (None,), integers=True))
+    count = len(float_array(scores, "scores", (None,)))
     scores = np.asarray(scores, dtype=np.float64)
     right = np.asarray(mask_array(right, "right", count))
     check_whole(num_true, "num_true", 1)

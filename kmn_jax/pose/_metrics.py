@@ -71,8 +71,8 @@ def discretise_symmetry(axis: ArrayInput, offset: ArrayInput, count: int) -> jax
     The turns are equally spaced and start with the identity. They stand for a continuous symmetry, or are exactly
     a discrete one of that order.
     """
-    axis = float_array(axis, "axis", (3,), integers=True)
-    offset = float_array(offset, "offset", (3,), integers=True)
+    axis = float_array(axis, "axis", (3,))
+    offset = float_array(offset, "offset", (3,))
     check_whole(count, "count", 1)
     if not is_traced(axis) and not np.asarray(axis).any():
         raise InputError("axis is zero, but must have a direction")
@@ -100,7 +100,7 @@ def recall(errors: ArrayInput, size: ArrayInput, threshold: ArrayInput = 0.1) ->
     and for sizes and thresholds that are not above zero.
     """
     errors = some_errors(errors)
-    size = float_array(size, "size", errors.shape if np.ndim(size) else (), integers=True)
+    size = float_array(size, "size", errors.shape if np.ndim(size) else ())
     if not is_traced(size) and not (np.asarray(size) > 0).all():
         raise InputError("size must be above zero")
     return (errors < positive_scalar(threshold, "threshold") * size).mean(dtype=jnp.float32)
@@ -137,7 +137,7 @@ def _checked(T_estimated: ArrayInput, T_true: ArrayInput, points: ArrayInput, *m
     """Return the arguments in float32, `motions` (s, 4, 4) of the object's frame in it among them."""
     given = (T_estimated, T_true, points, *motions)
     arrays = [rigid_pose(T_estimated, "T_estimated"), rigid_pose(T_true, "T_true"), _some_points(points)]
-    arrays += [float_array(some, "symmetries", (None, 4, 4), integers=True) for some in motions]
+    arrays += [float_array(some, "symmetries", (None, 4, 4)) for some in motions]
     if not any(map(is_traced, arrays)):
         _check_places(T_estimated, T_true, points)
         estimated, true, cloud, *several = (np.asarray(value, dtype=np.float64) for value in given)

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from kmn_jax.detection import ForegroundOptions, OrientedBox, Scene, make_scene, seed_keys, seeds_over
+from kmn_jax.detection._sources import read_source
 from kmn_jax.errors import InputError
 from kmn_jax.geometry import Camera, measured_points
 from kmn_jax.io import Scan
@@ -71,6 +72,14 @@ def test_frame_and_sensor_may_be_any(row: int) -> None:
     back = scene.points @ scene.T_scene_camera[:3, :3].T + scene.T_scene_camera[:3, 3]
     np.testing.assert_allclose(back, points, atol=1e-4)
     assert (scene.points[:, 2] > 3).all()
+
+
+@pytest.mark.parametrize("kind", [np.int16, np.int64, np.float16])
+def test_a_scan_may_be_of_numbers_of_any_kind(kind: type) -> None:
+    points = np.round(1000 * wall())[:400].astype(kind)
+    scan, _, _ = read_source(points, "mm", None, box_part())
+    assert scan.points.dtype == np.float32
+    np.testing.assert_array_equal(scan.points, points)
 
 
 def test_a_sensor_among_the_points_is_refused() -> None:

@@ -137,6 +137,23 @@ def test_stored_poses_are_judged_anew_by_other_evidence(
 
 
 @pytest.mark.usefixtures("searched")
+def test_another_verifier_sees_refined_poses_alone(
+    tmp_path: Path, network: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, known = tmp_path / "poses.npz", Sources(known_worlds=(Path("known"),))
+    made_of = np.array(module._made_of(known, FitOptions(), network))
+    store(path, network, (*EVIDENCE[:-1], "another verifier"), made_of=made_of)
+    assert EVIDENCE[-1] == VERIFIED
+    asked, searches = [], module.searches
+    monkeypatch.setattr(module, "searches", lambda *given: asked.append(given[0]) or searches(*given))  # type: ignore[func-returns-value]
+    monkeypatch.setattr(module, "picture_evidence", None)  # it is there
+    poses = poses_to_fit(known, FitOptions(), network, path)
+    np.testing.assert_array_equal(poses["evidence"][:, -1], [0, -1, -2, -3, -14, -15])
+    np.testing.assert_array_equal(poses["evidence"][:, :-1], np.tile(np.arange(len(EVIDENCE) - 1), (6, 1)))
+    assert asked == [Sources()]  # where no pose is refined, none is looked for
+
+
+@pytest.mark.usefixtures("searched")
 def test_stored_poses_are_judged_anew_if_that_is_asked_for(tmp_path: Path, network: Model) -> None:
     path = tmp_path / "poses.npz"
     store(path, network)

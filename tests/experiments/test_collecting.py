@@ -165,7 +165,7 @@ def test_searches_run_two_at_once_and_keep_their_order() -> None:
             release.set()
         return {"error": np.array([item])}
 
-    found = module._side_by_side(of_item, given())  # type: ignore[arg-type]
+    found = module.side_by_side(of_item, given())  # type: ignore[arg-type]
     assert [int(part["error"][0]) for part in found] == items
 
 
@@ -180,7 +180,7 @@ def test_an_error_ends_what_was_to_be_searched_next() -> None:
 
     items: Any = range(100)
     with pytest.raises(InputError, match="no such image"):
-        module._side_by_side(of_item, items)  # type: ignore[arg-type]
+        module.side_by_side(of_item, items)  # type: ignore[arg-type]
     assert len(begun) < 8
 
 

@@ -148,9 +148,13 @@ def test_each_pose_has_the_cells_of_its_own_search(tmp_path: Path, monkeypatch: 
         for row in (1, 0):
             scene, image = SimpleNamespace(image=10.0 * row), SimpleNamespace(errors="errors")
             facts = {"on_device": part, "scene": scene, "image": image, "errors": errors, "is_known": row == 1}
+            facts["name"] = f"search-{row}"
             yield SimpleNamespace(**facts), np.flatnonzero(poses["search"] == row)
 
+    shown: list[float] = []
+
     def cells(pose: np.ndarray, surfels: float, image: float, diameter: float) -> np.ndarray:
+        shown.append(float(pose[0, 3]))
         shape = (module.VERIFIER_SIDE, module.VERIFIER_SIDE, VERIFIER_CHANNELS)
         return np.full(shape, pose[0, 3] + image + surfels * diameter)
 
@@ -170,6 +174,14 @@ def test_each_pose_has_the_cells_of_its_own_search(tmp_path: Path, monkeypatch: 
     np.testing.assert_array_equal(found[:, 3, 5, 2], [2, 13.5, 4, 15.5])
     np.testing.assert_allclose(off, [0.2, 0.015, 0.2, 0.035])
     np.testing.assert_array_equal(stored["T_camera_object"][:, 0, 3], np.arange(4))
+    assert len(shown) == 4
+    again = module._seen(stored, options(tmp_path), nothing)  # what was ended goes on
+    np.testing.assert_array_equal(again[0], found)
+    np.testing.assert_array_equal(again[1], off)
+    assert len(shown) == 4
+    poses[2, 0, 3] = 7
+    np.testing.assert_array_equal(module._seen(stored, options(tmp_path), nothing)[0][:, 3, 5, 2], [2, 13.5, 9, 15.5])
+    assert sorted(shown[4:]) == [0, 7]  # of the search that found other poses
 
 
 def test_what_cannot_be_trained_is_refused(tmp_path: Path) -> None:

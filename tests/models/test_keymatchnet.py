@@ -272,7 +272,7 @@ def test_bad_input_gets_one_clear_error() -> None:
         (lambda: encode_scene(model, crop[None]), "must have shape"),
         (lambda: encode_scene(model, crop[:0]), "empty"),
         (lambda: encode_scene(model, crop[0]), "must have shape"),
-        (lambda: encode_scene(model, crop.astype(int)), "floating point"),
+        (lambda: encode_scene(model, crop.astype(bool)), "floating point"),
         (lambda: encode_scene(model, crop.astype(str)), "not an array of numbers|floating point"),
         (lambda: encode_scene(model, crop[:1] * 0), "no extent"),
         (lambda: encode_scene(model, crop, -1.0), "above zero"),

@@ -186,7 +186,7 @@ def test_bad_input_is_named():
     with pytest.raises(InputError, match="object_diameter is 0"):
         icp(model, scene, truth, 0.0, normals)
     with pytest.raises(InputError, match="floating"):
-        icp(model.astype(np.int32), scene, truth, DIAMETER, normals)
+        icp(model.astype(bool), scene, truth, DIAMETER, normals)
 
 
 @pytest.mark.parametrize(

@@ -204,7 +204,7 @@ BAD = {
     "not 3D": (np.ones((4, 2), np.float32), np.ones((4, 2), np.float32), None, "source has shape"),
     "flat": (np.ones(3, np.float32), np.ones((3, 3), np.float32), None, "source has shape"),
     "scalar": (np.float32(1), np.ones((3, 3), np.float32), None, "source has shape"),
-    "integers": (np.ones((4, 3), np.int32), np.ones((4, 3), np.float32), None, "floating"),
+    "truths": (np.ones((4, 3), bool), np.ones((4, 3), np.float32), None, "floating"),
     "NaN": (np.full((4, 3), np.nan, np.float32), np.ones((4, 3), np.float32), None, "NaN"),
     "infinite": (np.ones((4, 3), np.float32), np.full((4, 3), np.inf, np.float32), None, "infinite"),
     "weights": (np.ones((4, 3), np.float32), np.ones((4, 3), np.float32), np.ones(3, np.float32), "weights has shape"),
@@ -218,6 +218,12 @@ def test_bad_input_is_named(case):
     source, target, weights, message = BAD[case]
     with pytest.raises(InputError, match=message):
         kabsch(source, target, weights)
+
+
+def test_whole_numbers_are_points():
+    source = np.array([[0, 0, 0], [10, 0, 0], [0, 20, 0], [0, 0, 30]], np.uint8)
+    target = source[:, [1, 2, 0]] + np.int16(5)
+    np.testing.assert_array_equal(kabsch(source, target, [1, 1, 1, 1]), kabsch(source * 1.0, target * 1.0))
 
 
 def test_traced_points_that_are_not_finite_count_as_weight_zero():

@@ -146,7 +146,7 @@ def test_bad_input_is_named():
 
     bad = [
         (0, case[0][:, :1], "segmentation_logits has shape"),
-        (0, case[0].astype(np.int32), "segmentation_logits has dtype"),
+        (0, case[0].astype(bool), "segmentation_logits has dtype"),
         (1, case[1][0], "keypoint_logits has shape"),
         (1, case[1][:0], "keypoint_logits has shape"),
         (2, case[2][:5], "scene_points has shape"),

@@ -161,7 +161,7 @@ def test_bad_input_is_named(metric):
     with pytest.raises(InputError, match="points is empty"):
         metric(estimated, true, points[:0])
     with pytest.raises(InputError, match="floating"):
-        metric(estimated, true, points.astype(np.int32))
+        metric(estimated, true, points.astype(bool))
     with pytest.raises(InputError, match="points is empty"):
         diameter(points[:0])
 

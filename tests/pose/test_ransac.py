@@ -219,7 +219,7 @@ def test_bad_input_is_named():
     bad = [
         ({"object_points": matches.object_points[:, :2]}, "matches.object_points has shape"),
         ({"scene_points": matches.scene_points[:5]}, "matches.scene_points has shape"),
-        ({"scene_normals": matches.scene_normals.astype(np.int32)}, "matches.scene_normals has dtype"),
+        ({"scene_normals": matches.scene_normals.astype(bool)}, "matches.scene_normals has dtype"),
         ({"mask": np.ones(300, np.float32)}, "matches.mask has dtype"),
         ({"weights": -matches.weights}, "negative"),
     ]
