@@ -85,8 +85,7 @@ class State(NamedTuple):
 
 def train_verifier(options: Options) -> dict[str, Any]:
     """Train, write and print. Raises InputError if there is nothing to learn from."""
-    for target in (options.output, options.json):
-        check_target(target)
+    check_target(options.output, options.json)
     network = load_pretrained()
     poses = told(read_poses(options.candidates, options, options, network)[0])
     require(bool(poses["known"].any()), f"{options.candidates} holds no poses of known worlds: see --known-worlds")
@@ -120,10 +119,12 @@ def _seen(
 
     def see(item: tuple[Search, Int[np.ndarray, " k"]]) -> None:
         search, rows = item
-        path, given = folder / f"{search.name}.npz", poses["T_camera_object"][rows]
+        path = folder / f"{search.name}.npz"
+        given = {"given": poses["T_camera_object"][rows], "given_errors": errors[rows]}
         seen = read_columns(path) if path.exists() else {}
-        if not seen or not np.array_equal(seen["given"], given):  # other poses were found by another FILE
-            seen = {"given": given} | _seen_in(search, given, errors[rows])
+        # Another FILE may hold other poses, or the same by other errors.
+        if not seen or not all(np.array_equal(seen[name], values, equal_nan=True) for name, values in given.items()):
+            seen = given | _seen_in(search, *given.values())
             write_columns(path, seen)
         cells[rows], errors[rows] = seen["cells"], seen["errors"]
 

@@ -109,7 +109,9 @@ def float_array(
     """
     array = _array(_as_fractions(value, name), name, shape)
     if not jnp.issubdtype(array.dtype, jnp.floating):
-        raise InputError(f"{name} has dtype {array.dtype}, but must be floating point: convert it to float32")
+        raise InputError(
+            f"{name} has dtype {array.dtype}, but must be floating point or whole numbers: convert it to float32"
+        )
     if finite and not is_traced(array) and not is_traced(mask) and not _is_finite(array, mask):
         good = np.isfinite(np.asarray(array, dtype=np.float32))
         if mask is not None:

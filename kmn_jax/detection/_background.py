@@ -53,7 +53,7 @@ def bin_content(
     margins: BinMargins | None = None,
 ) -> Bool[Array, "h w"]:
     """Return which pixels of a depth image (h, w) show something inside of a bin; none where nothing was measured."""
-    depth = float_array(depth, "depth", (camera.height, camera.width), finite=False)
+    depth = _lengths(depth, "depth", (camera.height, camera.width))
     pose, low, high = _limits(T_camera_bin, bin, diameter, margins)
     points = depth_to_points(depth, jnp.asarray(camera.matrix, depth.dtype))
     inside = _inside(points.reshape(-1, 3), pose, low, high).reshape(depth.shape)
@@ -66,8 +66,8 @@ def in_front_of_empty(depth: ArrayInput, empty_depth: ArrayInput, diameter: floa
     Both images (h, w) are of one camera that did not move. Where only the empty bin has no depth, the pixel counts as
     content; combine with `bin_content` if its floor reflects.
     """
-    empty_depth = float_array(empty_depth, "empty_depth", (None, None), finite=False)
-    depth = float_array(depth, "depth", empty_depth.shape, finite=False)
+    empty_depth = _lengths(empty_depth, "empty_depth", (None, None))
+    depth = _lengths(depth, "depth", empty_depth.shape)
     length = _margin(diameter, margin)
     measured, known = (jnp.isfinite(image) & (image > 0) for image in (depth, empty_depth))
     return measured & (~known | (depth < empty_depth - length.astype(depth.dtype)))
@@ -95,6 +95,17 @@ def away_from_empty(
     nearest, _ = cKDTree(empty_points).query(points[finite], distance_upper_bound=1.01 * length)
     away[finite] = nearest > length
     return away
+
+
+def _lengths(depth: ArrayInput, name: str, shape: tuple[int | None, ...]) -> Float[Array, "h w"]:
+    """Return a depth image of lengths, which whole numbers, as sensors store them, are not."""
+    array = float_array(depth, name, shape, finite=False)
+    given = depth if isinstance(depth, jax.Array) else np.asarray(depth)
+    if jnp.issubdtype(given.dtype, jnp.integer):
+        raise InputError(
+            f"{name} holds whole numbers, of which it is not known how long they are: give lengths instead"
+        )
+    return array
 
 
 def _margin(diameter: float, margin: float) -> Scalar:

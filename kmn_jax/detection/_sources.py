@@ -181,11 +181,11 @@ def read_source(
         copies = [instance for instance in instances or () if instance.object_id == alike]
         return scan, tuple(instance.T_camera_object for instance in copies), ids
     single = np.asarray(float_array(source, "scan", (None, 3), finite=False), dtype=np.float32)
+    given = np.asarray(source)
+    if given.dtype.itemsize < 2:
+        raise InputError(f"the scan holds {given.dtype} values, as an image of colours does: give points, or its depth")
     real = np.isfinite(single).all(axis=1) & (single != 0).any(axis=1)
     if not real.any():
         raise InputError(f"none of the scan's {len(single)} points was measured: all are NaN, infinite or zero")
-    return (
-        Scan(held(np.asarray(source, dtype=np.float64)[real]), None, None, None, resolve_unit(asked, part.unit)),
-        None,
-        nothing,
-    )
+    points = held(given[real].astype(np.float64))
+    return Scan(points, None, None, None, resolve_unit(asked, part.unit)), None, nothing

@@ -43,7 +43,7 @@ def kabsch(source: ArrayInput, target: ArrayInput, weights: ArrayInput | None = 
         raise InputError(f"source has {count} points, but a pose needs at least 3")
     if used is not None and used.sum() < 3:
         raise InputError(f"weights are positive for {used.sum()} points only, but a pose needs at least 3")
-    dtype = jnp.float64 if jnp.float64 in (*(array.dtype for array in arrays), weights.dtype) else jnp.float32
+    dtype = jnp.float64 if jnp.float64 in [array.dtype for array in arrays] else jnp.float32
     if used is not None and dtype != jnp.float64 and not any(map(is_traced, arrays)):
         clouds = [np.asarray(points, dtype=np.float64)[used] for points in (source, target)]
         size = max(map(extent, clouds))

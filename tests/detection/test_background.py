@@ -152,5 +152,7 @@ def test_bad_input_is_named() -> None:
         inside_bin(np.zeros((1, 3), np.float32), camera_pose(), BIN, 0.0)
     with pytest.raises(InputError, match="depth has shape"):
         in_front_of_empty(depth, depth[:-1], DIAMETER, 0.1)
+    with pytest.raises(InputError, match="depth holds whole numbers"):
+        in_front_of_empty(np.full((4, 5), 900, np.uint16), np.ones((4, 5)), DIAMETER, 0.05)
     with pytest.raises(InputError, match="margin is -1"):
         in_front_of_empty(depth, depth, DIAMETER, -1.0)

@@ -32,6 +32,7 @@ matches = find_matches(logits[:, 1::-1] * 0 + [[0, 1]], logits, turned, faces, p
 results = ransac(jax.random.key(0), matches), icp(points, turned, pose, 3.0, faces, object_normals=normals)
 assert kinds((matches, results, kabsch(points, turned), pose)) == {"float32"}, kinds((matches, results))
 assert max(abs(result.T_scene_object - pose).max() for result in results) < 1e-5
+assert kabsch(points, turned, np.ones(60)).dtype == kabsch(points, turned, [1] * 60).dtype == jnp.float32
 assert kabsch(points.astype(float), turned.astype(float)).dtype == jnp.float64
 
 estimator = PoseEstimator.from_pretrained()

@@ -80,6 +80,8 @@ def test_a_scan_may_be_of_numbers_of_any_kind(kind: type) -> None:
     scan, _, _ = read_source(points, "mm", None, box_part())
     assert scan.points.dtype == np.float32
     np.testing.assert_array_equal(scan.points, points)
+    with pytest.raises(InputError, match="an image of colours"):
+        read_source(points.astype(np.uint8), "mm", None, box_part())
 
 
 def test_a_sensor_among_the_points_is_refused() -> None:

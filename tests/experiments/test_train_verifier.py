@@ -182,6 +182,8 @@ def test_each_pose_has_the_cells_of_its_own_search(tmp_path: Path, monkeypatch: 
     poses[2, 0, 3] = 7
     np.testing.assert_array_equal(module._seen(stored, options(tmp_path), nothing)[0][:, 3, 5, 2], [2, 13.5, 9, 15.5])
     assert sorted(shown[4:]) == [0, 7]  # of the search that found other poses
+    stored["error"] = stored["error"] / 2
+    np.testing.assert_allclose(module._seen(stored, options(tmp_path), nothing)[1], [0.1, 0.015, 0.1, 0.035])
 
 
 def test_what_cannot_be_trained_is_refused(tmp_path: Path) -> None:
