@@ -55,6 +55,7 @@ from experiments.training_parts import PARTS_SEED, TRAINING_FAMILIES
 from experiments.worlds import COMPOUND, TEST, TRAINING, VALIDATION, VERIFIER, Recipe, build_worlds
 from kmn_jax.data import Pack, PackConfig, PackedObject, Record, Source, build_pack
 from kmn_jax.errors import InputError, check_whole
+from kmn_jax.files import make_folder
 from kmn_jax.io import MESH_SUFFIXES
 from kmn_jax.simulate import PERFECT, BinScene, SensorConfig
 
@@ -114,7 +115,7 @@ class AllSurfels:
 
     def run(self) -> None:
         sources, licence = catalogue_sources(self.models, OUTPUTS / "kicad", self.limit)
-        self.folder.mkdir(parents=True, exist_ok=True)
+        make_folder(self.folder)
         with TemporaryDirectory(dir=self.folder) as made:
             paths = write_parts(Path(made), tuple(TRAINING_FAMILIES), self.parts, PARTS_SEED)
             sources += [Source(path.stem, "train", path) for path in paths]

@@ -39,7 +39,7 @@ from kmn_jax.detection import (
     verified,
 )
 from kmn_jax.errors import InputError, shown
-from kmn_jax.files import write_whole
+from kmn_jax.files import make_folder, write_whole
 from kmn_jax.models import Model
 from kmn_jax.objects import model_digest
 
@@ -194,7 +194,7 @@ class _Kept:
             return
         told = folder / "made_of.txt"
         if not folder.exists():
-            folder.mkdir(parents=True)
+            make_folder(folder)
             write_whole(told, made_of.encode())
         if not told.is_file() or told.read_text(encoding="utf-8") != made_of:
             raise InputError(f"{folder} holds searches by other weights or settings, or other evidence: remove it")

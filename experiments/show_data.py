@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, Int
 from kmn_jax.bop import BopDataset, BopFrame
 from kmn_jax.data import CropConfig, DevicePack, LabelledCrop, Pack, draw_crop, stack_pack, take_scene, visible_points
 from kmn_jax.errors import InputError
+from kmn_jax.files import make_folder
 from kmn_jax.geometry import depth_normals
 from kmn_jax.simulate import BIN, VisiblePoints
 
@@ -49,10 +50,7 @@ class ShowData:
             )
 
     def run(self) -> None:
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{self.folder} cannot be written to: {error.strerror}") from None
+        make_folder(self.folder)
         if self.pack is not None:
             pack = Pack(self.pack)
             for name in _spread(pack.names(), self.objects):

@@ -34,7 +34,7 @@ from experiments.fits import FitOptions, told, weights_of
 from experiments.searches import Columns, Search, Sources
 from kmn_jax.detection import PREDICTED_CHANNELS, VERIFIER_SIDE, call_rows, polish, verifier_cells
 from kmn_jax.errors import InputError, require
-from kmn_jax.files import write_whole
+from kmn_jax.files import make_folder, write_whole
 from kmn_jax.models import (
     VERIFIER,
     VERIFIER_CHANNELS,
@@ -115,7 +115,7 @@ def _seen(
     cells = np.empty((len(poses["error"]), VERIFIER_SIDE, VERIFIER_SIDE, VERIFIER_CHANNELS), dtype=np.float16)
     errors = poses["error"].copy()
     folder = options.candidates.with_name(f"{options.candidates.name}.shown_{_SHOWN}")
-    folder.mkdir(exist_ok=True)
+    make_folder(folder)
 
     def see(item: tuple[Search, Int[np.ndarray, " k"]]) -> None:
         search, rows = item

@@ -23,6 +23,8 @@ from kmn_jax.session import Request, Session, Units, unit_of
 if TYPE_CHECKING:
     from kmn_jax.serve import ServerAnswer
 
+_STDOUT = Path("-")
+
 
 def prepare(
     source: Annotated[Path, tyro.conf.Positional],
@@ -69,16 +71,18 @@ def detect(
     Args:
         request: what to look for, and where.
         top: return the first poses only.
-        json: file for the result as JSON, see docs/detect.md.
+        json: file for the result as JSON, see docs/detect.md; - prints that in place of the table.
         bop_csv: file for the result as BOP's csv.
         save_picture: file for a picture of scene, segmentation, keypoints and poses (PNG).
         server: address of a kmn serve that searches instead of this process.
     """
     from kmn_jax.bop import bop_files
-    from kmn_jax.detection import DetectConfig, as_json, table, write_bop_csv, write_json
+    from kmn_jax.detection import DetectConfig, as_json, json_text, table, write_bop_csv
 
     if top is not None:
         check_whole(top, "top", 1)
+    is_json_printed = json == _STDOUT
+    json = None if is_json_printed else json
     read = (*request.files, Path(request.weights), *bop_files(request.scene))
     check_outputs((json, bop_csv, save_picture), *read)
     check_inputs(*request.files)
@@ -98,7 +102,7 @@ def detect(
         found, bop_ids, result = answer.found, answer.bop_ids, answer.result
     # Files first: whoever reads what is printed may stop reading.
     if json is not None:
-        write_json(result, json)
+        write_whole(json, f"{json_text(result)}\n".encode())
     if bop_csv is not None:
         write_bop_csv(found, bop_csv, *bop_ids)
     if save_picture is not None and server is None:
@@ -107,6 +111,9 @@ def detect(
         draw(save_picture, session.scene, session.part, found, session.scene.truth)
     elif save_picture is not None:
         write_whole(save_picture, answer.picture)
+    if is_json_printed:
+        say(json_text(result))
+        return
     written = [f"wrote {target}" for target in (json, bop_csv, save_picture) if target is not None]
     say("\n".join([table(found, DetectConfig().accepted), *written]))
 

@@ -58,6 +58,14 @@ def write_whole(path: str | Path, content: bytes) -> None:
         raise InputError(f"cannot write {path}: {error.strerror}") from None
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those above it, if it is not there. Raises InputError if there can be none."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be written to: {error.strerror}") from None
+
+
 def _remove_left_over(target: Path) -> None:
     """Remove temporary files of a target that no process holds locked, or made just now and is about to lock."""
     name = re.compile(rf"\.{re.escape(_start_of(target))}\.[0-9a-f]{{16}}")

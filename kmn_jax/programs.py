@@ -17,6 +17,7 @@ import signal
 import socket
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, cached_property, update_wrapper
@@ -49,7 +50,8 @@ _OUTSIDE = get_opaque_trace_state(convention="nnx")  # of all traces, as Flax te
 def keep_compiled() -> None:
     """Keep programs between processes, in the user's cache, or where JAX_COMPILATION_CACHE_DIR says.
 
-    Without a home, or with one that cannot be written to, nothing is kept.
+    Without a home, or with one that cannot be written to, nothing is kept; what a folder holds is used though it cannot
+    be written to.
     """
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         with contextlib.suppress(OSError, RuntimeError):
@@ -57,6 +59,7 @@ def keep_compiled() -> None:
             folder.mkdir(parents=True, exist_ok=True)
             if os.access(folder, os.W_OK):
                 jax.config.update("jax_compilation_cache_dir", str(folder))
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")  # which costs time
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     chosen = jax.config.values["jax_compilation_cache_dir"]
     if chosen:

@@ -16,8 +16,7 @@ from typing import Any
 
 import jax
 
-from kmn_jax.errors import InputError
-from kmn_jax.files import check_outputs, write_whole
+from kmn_jax.files import check_outputs, make_folder, write_whole
 
 
 def environment() -> dict[str, Any]:
@@ -74,12 +73,8 @@ def check_target(*paths: Path | None) -> None:
     Raises InputError if a file cannot be written, or is to hold two results.
     """
     for path in paths:
-        if path is None:
-            continue
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"cannot make the folder {path.parent}: {error.strerror}") from None
+        if path is not None:
+            make_folder(path.parent)
     check_outputs(paths)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -50,6 +53,16 @@ def test_a_cache_that_cannot_be_written_to_is_done_without(
     assert capfd.readouterr().err == ""
     assert (tmp_path / "b.safetensors").exists()
     assert jax.config.values["jax_compilation_cache_dir"] is None
+
+
+def test_a_cache_that_is_named_and_cannot_be_written_to_is_done_without(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    program = (
+        "import jax; from kmn_jax.programs import keep_compiled; keep_compiled(); print(jax.jit(lambda x: 3 * x)(2.0))"
+    )
+    named = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "file" / "cache")}
+    ended = subprocess.run([sys.executable, "-c", program], env=named, capture_output=True, text=True, check=True)
+    assert (ended.stdout, ended.stderr) == ("6.0\n", "")
 
 
 def test_a_cache_that_can_be_written_to_is_used(

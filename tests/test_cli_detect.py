@@ -273,26 +273,42 @@ def test_what_pictures_need_is_asked_for_before_the_search(
     assert list(tmp_path.iterdir()) == []
 
 
+class Empty:
+    """A search that finds nothing, at once."""
+
+    part = SimpleNamespace(model_digest="0")
+    scene = SimpleNamespace(bop_ids=(0, 0))
+    places = None
+
+    def __init__(self, request: object) -> None:
+        pass
+
+    def detect(self, places: None, top: int | None) -> Detections:
+        return Detections("motor", "mm", (), Timing({}, 0.0), "nothing is there")
+
+
+def test_json_is_printed_in_place_of_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("kmn_jax.cli.Session", Empty)
+    monkeypatch.chdir(tmp_path)
+    given = ["detect", "--object", str(MOTOR), "--scene", str(IMAGE)]
+    assert main([*given, "--json", "-", "--bop-csv", "a.csv"]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert main([*given, "--json", "a.json"]) == 0
+    assert printed.out == Path("a.json").read_text()
+    assert json.loads(printed.out)["reason"] == "nothing is there"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.csv", "a.json"]
+
+
 def test_results_are_written_though_nobody_reads_the_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    class Session:
-        """A search that finds nothing, at once."""
-
-        part = SimpleNamespace(model_digest="0")
-        scene = SimpleNamespace(bop_ids=(0, 0))
-        places = None
-
-        def __init__(self, request: object) -> None:
-            pass
-
-        def detect(self, places: None, top: int | None) -> Detections:
-            return Detections("motor", "mm", (), Timing({}, 0.0), "nothing is there")
-
     def closed(found: Detections, accepted: float) -> str:
         raise BrokenPipeError
 
-    monkeypatch.setattr("kmn_jax.cli.Session", Session)
+    monkeypatch.setattr("kmn_jax.cli.Session", Empty)
     monkeypatch.setattr("kmn_jax.detection.table", closed)
     target = tmp_path / "a.json"
     with (tmp_path / "out").open("w") as out:

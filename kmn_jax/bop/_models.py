@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32, Int
 
 from kmn_jax.bop._files import BopFault, Entry, checked_file, files_by_id, json_by_id, millimetres, read_json_by_id
 from kmn_jax.errors import InputError
-from kmn_jax.files import write_whole
+from kmn_jax.files import make_folder, write_whole
 from kmn_jax.objects import ObjectModel
 
 NAMES_FILE = "object_names.json"  # ours: BOP objects have numbers only
@@ -39,10 +39,7 @@ def write_models(folder: str | Path, models: Mapping[int, ObjectModel]) -> None:
         if object_id < 1:
             raise InputError(f"models: object id {object_id} must be 1 or more")
     target = Path(folder) / "models"
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot write {target}: {error.strerror}") from None
+    make_folder(target)
     for object_id, model in models.items():
         factor = millimetres(model.unit)
         vertices, normals = model.vertices, vertex_normals(model.vertices, model.triangles)

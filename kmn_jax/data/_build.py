@@ -22,6 +22,7 @@ from typing import Any, TypeVar
 from kmn_jax.data._pack import VERSION, Entry, read_entry, write_manifest, write_object
 from kmn_jax.data._recipe import PackConfig, pack_object
 from kmn_jax.errors import InputError, shown
+from kmn_jax.files import make_folder
 from kmn_jax.limits import parse_json
 
 _T = TypeVar("_T")
@@ -81,10 +82,7 @@ def build_pack(
     if len(wanted) != len(sources):
         raise InputError(f"{len(sources) - len(wanted)} sources have the name of another: names must differ")
     folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder} cannot be written to: {error.strerror}") from None
+    make_folder(folder)
     journal = _Journal(folder / "journal.jsonl", config)
     left = [source for source in sources if not _is_done(folder, journal.records.get(source.name), retry_rejected)]
     bar = tqdm(total=len(sources), initial=len(sources) - len(left), unit="object", mininterval=1, smoothing=0.05)

@@ -68,7 +68,7 @@ from kmn_jax.detection._frames import into, placed
 from kmn_jax.detection._grasps import Conflict, Copy, grasp_conflict, with_grasps
 from kmn_jax.detection._kept_parts import prepare_kept
 from kmn_jax.detection._mapping import call_rows, map_real, map_rows
-from kmn_jax.detection._output import as_json, describe, table, write_bop_csv, write_json
+from kmn_jax.detection._output import as_json, describe, json_text, table, write_bop_csv
 from kmn_jax.detection._picture_agreement import PictureAgreement, picture_agreement
 from kmn_jax.detection._picture_cells import PREDICTED_CHANNELS, VERIFIER_SIDE, verifier_cells
 from kmn_jax.detection._polish import polish
@@ -176,6 +176,7 @@ __all__ = [
     "inside_bin",
     "into",
     "join",
+    "json_text",
     "keeps_order",
     "load_lightgbm",
     "load_probabilities",
@@ -221,5 +222,4 @@ __all__ = [
     "warnings_once",
     "with_grasps",
     "write_bop_csv",
-    "write_json",
 ]

@@ -11,7 +11,6 @@ import numpy as np
 
 from kmn_jax.bop import BopEstimate, write_results
 from kmn_jax.detection._result import Detection, Detections, pose_notes
-from kmn_jax.files import write_whole
 from kmn_jax.objects import Part
 from kmn_jax.units import place_text
 
@@ -23,9 +22,9 @@ def as_json(found: Detections, object_name: str, scene_name: str, facts: Mapping
     return {**found.to_dict(), "object": object_name, "scene": scene_name, **facts}
 
 
-def write_json(found: Mapping[str, Any], path: str | Path) -> None:
-    """Write JSON values to a file that appears whole."""
-    write_whole(path, (json.dumps(found, indent=1, allow_nan=False) + "\n").encode())
+def json_text(found: Mapping[str, Any]) -> str:
+    """Return JSON values as text, in which other characters than ASCII are escaped."""
+    return json.dumps(found, indent=1, allow_nan=False)
 
 
 def write_bop_csv(

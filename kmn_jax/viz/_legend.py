@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,8 @@ ACCEPTED = DetectConfig().accepted  # poses below that probability are drawn pal
 NOT_THE_PART = (0.30, 0.32, 0.36)  # the colour of points of crops that are on no copy
 UNEXPLAINED = (0.62, 0.40, 0.22)  # that of foreground on no pose
 _LISTED = 16  # poses
-_LISTED_WARNINGS = 6
+_ROWS, _COLUMNS = 30, 50  # of text in the list
+_NOTE_LINE, _NOTE_GAP = 0.72, 0.35  # rows: the lines of notes stand closer
 _PART_SIDE = 300  # pixels
 
 
@@ -59,7 +61,7 @@ def draw_part(axis: Any, part: Part, direction: tuple[float, float, float], titl
 def draw_list(axis: Any, found: Detections) -> None:
     """List the poses, and the warnings about them."""
     axis.set_axis_off()
-    axis.set(xlim=(0, 1), ylim=(_LISTED + 2 * _LISTED_WARNINGS + 2, 0))
+    axis.set(xlim=(0, 1), ylim=(_ROWS, 0))
     if found.poses:
         axis.text(0.1, 0, "rank probability visible inliers", fontsize=9, va="center", color="0.35", family="monospace")
     for row, (pose, color) in enumerate(zip(found.poses, distinct_colors(_LISTED), strict=False), start=1):
@@ -71,10 +73,21 @@ def draw_list(axis: Any, found: Detections) -> None:
     notes = [*dict.fromkeys(found.warnings), *pose_notes(found)]
     if len(found.poses) > _LISTED:
         notes.insert(0, f"and {len(found.poses) - _LISTED} more poses")
-    if len(notes) > _LISTED_WARNINGS:
-        notes[_LISTED_WARNINGS - 1 :] = [f"and {len(notes) - _LISTED_WARNINGS + 1} more warnings"]
     below = min(len(found.poses), _LISTED) + 1.6
-    for note in notes:
-        text = textwrap.fill(textwrap.shorten(note, 150, placeholder=" ..."), 50)
+    for text in fitting([textwrap.fill(note, _COLUMNS) for note in notes], _ROWS - below):
         axis.text(0.0, below, text, fontsize=8.5, va="top", color="#a04000", parse_math=False)
-        below += 1 + text.count("\n")
+        below += _rows_of(text)
+
+
+def fitting(notes: Sequence[str], rows: float) -> list[str]:
+    """Return the first notes, as many as fit whole; if that is not all, the last text says how many are left out."""
+    ends = np.cumsum([_rows_of(note) for note in notes])
+    if len(notes) == 0 or ends[-1] <= rows:
+        return list(notes)
+    whole = int((ends <= rows - _rows_of("and more")).sum())
+    left = len(notes) - whole
+    return [*notes[:whole], f"and {left} more {'notes' if left > 1 else 'note'}"]
+
+
+def _rows_of(note: str) -> float:
+    return _NOTE_LINE * (1 + note.count("\n")) + _NOTE_GAP

@@ -121,7 +121,7 @@ def test_frames_in_which_nothing_is_found_get_no_faults(
 @pytest.mark.parametrize("run", [attack.main, kills.main])
 def test_a_place_for_results_is_made_before_what_takes_time(run: Callable[..., int], tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(InputError, match="cannot make the folder"):
+    with pytest.raises(InputError, match="cannot be written to"):
         run(json=tmp_path / "file" / "a.json")
 
 

@@ -16,7 +16,7 @@ from kmn_jax.detection import CropPrediction, Detection, Detections, Scene, warn
 from kmn_jax.errors import InputError
 from kmn_jax.objects import Part, Symmetries
 from kmn_jax.viz import TRUTH_COLORS, distinct_colors, save_picture, truth_codes
-from kmn_jax.viz._legend import UNEXPLAINED
+from kmn_jax.viz._legend import UNEXPLAINED, fitting
 from kmn_jax.viz._raster import Canvas
 from kmn_jax.viz._truth import BACKGROUND, FALSE_PART, MISSED, RIGHT, WRONG_KEYPOINT, surface_distances
 from tests.detection.box_sample import CAMERA, POSES, SIZES, both_boxes, box_part, box_view
@@ -210,6 +210,25 @@ def test_many_poses_take_little_time(part: Part, view: Scene, found: Detections,
     save_picture(tmp_path / "one.png", view, part, many)
     assert time.process_time() - start < 6  # about 1.5 on an idle machine
     assert drawn(tmp_path / "one.png").std() > 10
+
+
+def test_notes_are_shown_whole_as_many_as_fit() -> None:
+    notes = ["one line", "two\nlines", "three\nlines\nall"]
+    assert fitting(notes, 30.0) == notes
+    assert fitting([], 0.0) == []
+    assert fitting(notes, 5.0) == [*notes[:2], "and 1 more note"]
+    assert fitting(notes, 3.0) == [notes[0], "and 2 more notes"]
+
+
+def test_the_list_of_poses_keeps_its_notes_inside(part: Part, view: Scene, found: Detections, tmp_path: Path) -> None:
+    long = tuple(f"note {row} of the scan: " + "what is wrong with it takes many words to say " * 5 for row in range(9))
+    for poses, warnings in ((found.poses[:1], long[:1]), (found.poses * 8, long)):
+        save_picture(tmp_path / "notes.png", view, part, replace(found, poses=poses, warnings=warnings))
+        rows, columns = np.nonzero((np.abs(drawn(tmp_path / "notes.png").astype(int) - (160, 64, 0)) < 8).all(axis=2))
+        height, width = drawn(tmp_path / "notes.png").shape[:2]
+        assert len(rows) > 100
+        assert rows.max() < 0.99 * height
+        assert columns.max() < 0.995 * width
 
 
 def test_what_cannot_be_written_is_refused(part: Part, view: Scene, found: Detections, tmp_path: Path) -> None:
