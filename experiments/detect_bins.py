@@ -36,15 +36,13 @@ from kmn_jax.detection import (
     Detections,
     Probabilities,
     chance_calibration_error,
-    chosen,
+    choose_and_refine,
     detect,
     detections,
     device_part,
     expected_calibration_error,
     explore,
     load_probabilities,
-    refined_candidates,
-    reported,
 )
 from kmn_jax.errors import InputError
 from kmn_jax.models import Model, load_model, load_pretrained
@@ -229,15 +227,8 @@ def _found(name: str, model: Model, fitted: Probabilities, image: BinImage) -> D
     on_device, clock = device_part(model, image.part), Clock()
     propose = partial(fpfh_poses, image.part, on_device, image.scene)
     candidates, warnings = explore(image.scene, image.part, propose, fitted.found, CONFIG, clock)
-    with clock("selection"):
-        choice = chosen(candidates, fitted.found, on_device, CONFIG)
-    rows = np.flatnonzero(choice.kept | choice.contenders)
-    if len(rows):
-        with clock("refinement"):
-            candidates = refined_candidates(on_device, image.scene, candidates, rows, 0, CONFIG.search)
-            choice, probability = reported(candidates, fitted, on_device, CONFIG, image.scene.is_narrowed)
-    else:
-        probability = fitted.found.probability(candidates.evidence)
+    given = on_device, image.scene, 0, CONFIG, CONFIG.search, clock
+    candidates, choice, probability = choose_and_refine(candidates, fitted, *given)
     poses = detections(candidates, choice, probability, image.part, image.scene)
     return Detections(image.part.name, image.scene.unit, poses, clock.timing, None, warnings)
 

@@ -18,6 +18,8 @@ from kmn_jax.detection._calibration import (
     vouched,
 )
 from kmn_jax.detection._canonical import canonical_pose
+from kmn_jax.detection._choice import Choice, choose_and_refine, chosen, refined_candidates, reported
+from kmn_jax.detection._config import FAST, THOROUGH, DetectConfig, Effort, config_of
 from kmn_jax.detection._coverage import near_surface
 from kmn_jax.detection._crop_search import (
     CropPoses,
@@ -34,19 +36,7 @@ from kmn_jax.detection._depth_agreement import (
     depth_agreement,
     depth_buffer,
 )
-from kmn_jax.detection._detect import (
-    FAST,
-    THOROUGH,
-    DetectConfig,
-    Effort,
-    chosen,
-    config_of,
-    detect,
-    detections,
-    explore,
-    refined_candidates,
-    reported,
-)
+from kmn_jax.detection._detect import detect, detections, explore
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place, symmetry_transforms
 from kmn_jax.detection._draw import (
     CropSearchConfig,
@@ -111,6 +101,7 @@ __all__ = [
     "Calibration",
     "CalibrationArrays",
     "Candidates",
+    "Choice",
     "Clock",
     "Conflict",
     "Copy",
@@ -152,6 +143,7 @@ __all__ = [
     "candidates_of",
     "canonical_pose",
     "chance_calibration_error",
+    "choose_and_refine",
     "chosen",
     "company",
     "config_of",

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
@@ -13,16 +13,15 @@ from jaxtyping import Float, Int
 
 from kmn_jax.detection._calibration import Calibration, Probabilities
 from kmn_jax.detection._canonical import canonical_pose
+from kmn_jax.detection._choice import choose_and_refine, chosen
+from kmn_jax.detection._config import DetectConfig
 from kmn_jax.detection._coverage import cover, nothing_covered, to_search, unexplained
-from kmn_jax.detection._crop_search import CropPoses
 from kmn_jax.detection._depth_agreement import DepthImage
 from kmn_jax.detection._device_part import DevicePart, device_part, same_place
-from kmn_jax.detection._draw import CropSearchConfig
 from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
 from kmn_jax.detection._frames import placed
-from kmn_jax.detection._mapping import call_rows
-from kmn_jax.detection._polish import polish, polish_one
-from kmn_jax.detection._refinement import refine_many, refine_one
+from kmn_jax.detection._polish import polish_one
+from kmn_jax.detection._refinement import refine_one
 from kmn_jax.detection._result import Detection, Detections
 from kmn_jax.detection._scene import Scene
 from kmn_jax.detection._search import (
@@ -32,22 +31,19 @@ from kmn_jax.detection._search import (
     join,
     no_poses,
     search_at,
-    seed_keys,
 )
 from kmn_jax.detection._seeds import NUM_SEEDS, seeds_at, seeds_over
-from kmn_jax.detection._selection import Selection, select_poses
+from kmn_jax.detection._selection import Selection
 from kmn_jax.detection._timing import Clock
-from kmn_jax.detection._verification import VERIFIED, verified, verify_ahead
-from kmn_jax.errors import InputError
+from kmn_jax.detection._verification import verify_ahead
 from kmn_jax.geometry import PaddedCloud
 from kmn_jax.io import object_doubt
-from kmn_jax.models import KeyMatchNetConfig, Model
+from kmn_jax.models import Model
 from kmn_jax.objects import Part
 from kmn_jax.programs import meanwhile
 
 _SHARES = ("explained", "violated", "occluded", "unknown")
 _CLOSE_GAP = 0.05  # of probabilities
-_CONSIDERED = 128  # most probable poses that are compared with each other: one number, so one compilation
 _MOST_UNEXPLAINED = 0.5  # of the foreground: with more, it is told how to narrow it down
 _FLUSH = 0.4  # of the outline: with more of it in the plane of a larger surface, a pose may be on a wall or a table
 _MANY_FLUSH = 3  # poses: fewer need not be told
@@ -61,59 +57,6 @@ _RIVALLED = (
     "another pose in this place is nearly as probable: the object may be turned about its axis or lie the other way"
     " round"
 )
-
-
-@dataclass(frozen=True)
-class DetectConfig:
-    """How a scene is searched; lengths are shares of the object's diameter."""
-
-    search: SearchConfig = field(default_factory=SearchConfig)
-    give_up: bool = True  # on seeds whose first draw has no pose; not where places are given
-    many_points: bool = False  # in each draw, and more draws, as always where places are given: `CropSearchConfig`
-    patience: int | None = 3  # rounds with nothing promising, after which it is not searched finely; None goes on
-    later_seeds: int = 16  # at most in a round after the first; rounds go on until the foreground is covered
-    most_seeds: int = 512  # at least so many are searched before it is given up to cover the foreground
-    likely: float = 0.5  # the probability from which on a pose, as it is found, explains points: they are done
-    promising: float = 0.1  # that from which on such a pose, in a new place, is a reason to go on, as likely ones are
-    accepted: float = 0.8  # that from which on a pose counts as found: in world bins 95% of such poses are right
-    reported: float = 0.1  # less probable poses are left out
-
-    def __post_init__(self) -> None:
-        if self.patience is not None and self.patience < 1:
-            raise InputError(f"patience = {self.patience} must be at least 1, or none")
-        if not (0 <= self.promising <= 1 and 0 <= self.likely <= 1):
-            raise InputError(f"promising = {self.promising} and likely = {self.likely} must be probabilities")
-        if min(self.later_seeds, self.most_seeds) < 1 or not 0 <= self.reported <= self.accepted <= 1:
-            raise InputError(
-                f"later_seeds = {self.later_seeds} and most_seeds = {self.most_seeds} must be at least 1, and reported"
-                f" = {self.reported} and accepted = {self.accepted} probabilities in this order"
-            )
-
-    def search_of(self, config: KeyMatchNetConfig, at_places: bool = False) -> SearchConfig:
-        """Return how is searched with a network: around seeds all over the scene, or at places that are given."""
-        crops = self.search.crops
-        if at_places or self.many_points:
-            search = replace(self.search, crops=crops.of_network(config))
-        else:
-            search = self.search.of_network(config)
-        give_up = crops.give_up or (self.give_up and not at_places)
-        return replace(search, crops=replace(search.crops, give_up=give_up))
-
-
-FAST = DetectConfig(search=SearchConfig(crops=CropSearchConfig(num_draws=1)))
-THOROUGH = DetectConfig(patience=None, give_up=False, many_points=True)
-Effort = Literal["fast", "usual", "thorough"]
-
-
-def config_of(effort: str) -> DetectConfig:
-    """Return how is searched with an effort: "fast", "usual" or "thorough".
-
-    docs/detect.md says what they gain and cost. Raises InputError if there is no such effort.
-    """
-    known = {"fast": FAST, "usual": DetectConfig(), "thorough": THOROUGH}
-    if effort not in known:
-        raise InputError(f"effort = {effort!r} is not known: choose among {', '.join(known)}")
-    return known[effort]
 
 
 def detect(
@@ -140,19 +83,15 @@ def detect(
             meanwhile(compile_ahead, on_device, scene.cloud, scene.image, search, model.config.num_keypoints)
         found, more = explore(scene, part, propose, probabilities.found, config, clock)
         warnings = (*warnings, *more)
+        found, choice, probability = choose_and_refine(
+            found, probabilities, on_device, scene, random_seed, config, search, clock
+        )
     else:
         with clock("search"):
             found = propose(seeds_at(scene, at))
             found = found._replace(usable=found.usable & found.is_first)
-    with clock("selection"):
-        choice = chosen(found, probabilities.found, on_device, config)
-    if at is None and choice.kept.any():
-        with clock("refinement"):
-            rows = np.flatnonzero(choice.kept | choice.contenders)
-            found = refined_candidates(on_device, scene, found, rows, random_seed, search)
         with clock("selection"):
-            choice, probability = reported(found, probabilities, on_device, config, scene.is_narrowed)
-    else:
+            choice = chosen(found, probabilities.found, on_device, config)
         probability = probabilities.found.probability(found.evidence)
     with clock("report"):
         poses = detections(found, choice, probability, part, scene)
@@ -212,101 +151,6 @@ def compile_ahead(
     refine_one(pose, row, jax.random.key(0), on_device, cloud, image, config.crops.smooth, config.agreement)
     polish_one(pose, on_device, image)
     verify_ahead(pose, on_device, image)
-
-
-def refined_candidates(
-    on_device: DevicePart,
-    scene: Scene,
-    found: Candidates,
-    rows: Int[np.ndarray, " k"],
-    random_seed: int,
-    config: SearchConfig,
-) -> Candidates:
-    """Return some of the candidates refined on all points around them, and turned forms of them that fit as well.
-
-    The first k are the candidates themselves. All are polished, so that what is compared are the best poses of each
-    form, and have evidence of their own.
-    """
-    given = (on_device, scene.cloud, scene.image, config.crops.smooth, config.agreement)
-    seeds = found.seed_rows[found.crop[rows]]
-    poses, there = call_rows(
-        lambda pose, row, key: refine_one(pose, row, jax.random.wrap_key_data(key), *given),
-        lambda poses, rows, keys: refine_many(poses, rows, keys, *given),
-        found.T_camera_object[rows],
-        seeds.astype(np.int32),
-        seed_keys(seeds, random_seed),
-    )
-    poses = np.array(poses)
-    poses[there] = polish(poses[there], on_device, scene.image)
-    # The refined forms take the place of the poses of their crops.
-    forms = there.shape[1]
-    own = jax.tree.map(
-        lambda leaf: np.repeat(leaf.reshape(-1, *leaf.shape[2:])[rows, None], forms, axis=1),
-        (found.found.poses, found.found.scores),
-    )
-    wide = own[0]._replace(T_scene_object=poses, converged=there)
-    crops: CropPoses = jax.tree.map(lambda leaf: leaf[found.crop[rows]], found.found)
-    crops = crops._replace(poses=wide, scores=own[1])
-    agreement = config.agreement
-
-    def proof(crops: CropPoses) -> Float[jax.Array, "a f"]:
-        return gather_evidence(crops, on_device.arrays, on_device.surfels, scene.image, agreement)
-
-    evidence = np.array(call_rows(proof, jax.vmap(proof), crops))
-    evidence[there, EVIDENCE.index(VERIFIED)] = verified(poses[there], on_device, scene)
-    return Candidates(
-        _forms_first(poses),
-        _forms_first(there),
-        _forms_first(evidence),
-        _forms_first(wide.num_inliers),
-        np.tile(found.crop[rows], forms),
-        found.found,
-        found.seed_rows,
-    )
-
-
-def _forms_first(leaf: Any) -> np.ndarray:
-    """Return rows of forms (k, a, ...) one form after the other, (a * k, ...)."""
-    return np.swapaxes(leaf, 0, 1).reshape(-1, *leaf.shape[2:])
-
-
-def chosen(
-    found: Candidates,
-    calibration: Calibration,
-    part: DevicePart,
-    config: DetectConfig,
-    exact: Calibration | None = None,
-) -> Selection:
-    """Choose among the most probable candidates, by an `exact` model where there is one."""
-    probability = np.zeros(len(found.usable))
-    probability[found.usable] = calibration.probability(found.evidence[found.usable])
-    possible = found.usable & (probability >= config.reported)
-    ranked = np.argsort(-np.where(possible, probability, -1), kind="stable")[:_CONSIDERED]
-    rows = np.pad(ranked, (0, _CONSIDERED - len(ranked)), mode="edge")
-    usable = possible[rows] & (np.arange(_CONSIDERED) < len(ranked))
-    poses = found.T_camera_object[rows]
-    score = probability.copy()
-    if exact is not None:
-        score[possible] = exact.probability(found.evidence[possible])
-    given = jax.device_put((poses, score[rows].astype(np.float32), usable))
-    few: Selection = jax.device_get(select_poses(given[0], given[1], given[2], part))
-
-    def of_all(values: Any) -> Any:
-        result = np.zeros(len(possible), dtype=values.dtype)
-        result[ranked] = values[: len(ranked)]
-        return result
-
-    return Selection(*map(of_all, few))
-
-
-def reported(
-    refined: Candidates, probabilities: Probabilities, part: DevicePart, config: DetectConfig, is_narrowed: bool
-) -> tuple[Selection, Float[np.ndarray, " s"]]:
-    """Choose among refined candidates, and return also how probable those that stand are, given each other."""
-    choice = chosen(refined, probabilities.refined, part, config, probabilities.exact)
-    probability = np.zeros(len(choice.kept))
-    probability[choice.kept] = probabilities.of_scene(refined.evidence[choice.kept], is_narrowed)
-    return choice, probability
 
 
 def detections(

@@ -12,8 +12,9 @@ from jaxtyping import Float
 
 from kmn_jax.bop import is_bop_image
 from kmn_jax.detection._calibration import Probabilities, calibration_beside, load_probabilities
+from kmn_jax.detection._config import DetectConfig
 from kmn_jax.detection._coverage import unexplained
-from kmn_jax.detection._detect import DetectConfig, detect
+from kmn_jax.detection._detect import detect
 from kmn_jax.detection._evidence import EVIDENCE
 from kmn_jax.detection._exclusion import apart
 from kmn_jax.detection._foreground import ForegroundOptions

@@ -26,7 +26,7 @@ from kmn_jax.detection import (
     verified,
     verifier_cells,
 )
-from kmn_jax.detection import _detect as detecting
+from kmn_jax.detection import _choice as choosing
 from kmn_jax.detection import _verification as module
 from kmn_jax.detection._picture_cells import measured, predicted
 from kmn_jax.detection._search import no_poses
@@ -154,10 +154,10 @@ def test_refined_poses_alone_are_shown_to_it(monkeypatch: pytest.MonkeyPatch) ->
         found_by_rows.append(many(*items))
         return found_by_rows[-1]
 
-    monkeypatch.setattr(detecting, "call_rows", rows)
-    monkeypatch.setattr(detecting, "refine_many", refined)
-    monkeypatch.setattr(detecting, "polish", lambda poses, part, image: poses)
-    monkeypatch.setattr(detecting, "verified", said)
+    monkeypatch.setattr(choosing, "call_rows", rows)
+    monkeypatch.setattr(choosing, "refine_many", refined)
+    monkeypatch.setattr(choosing, "polish", lambda poses, part, image: poses)
+    monkeypatch.setattr(choosing, "verified", said)
     config = SearchConfig(CropSearchConfig(num_points=64, num_draws=1))
     none = no_poses(config.crops, 8)
     crops = jax.tree.map(lambda leaf: np.stack([np.asarray(leaf)] * 2), none)

@@ -1,0 +1,203 @@
+"""Which candidates are refined, and which of them stand: the best of each place and, while it is doubtful, others.
+
+What is said of a pose as it was found is rough: of several in one place, another one may become the better pose once
+all are refined. So more of them are refined wherever none has become a sure one.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from kmn_jax.detection._calibration import Calibration, Probabilities
+from kmn_jax.detection._config import DetectConfig
+from kmn_jax.detection._crop_search import CropPoses
+from kmn_jax.detection._device_part import DevicePart
+from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
+from kmn_jax.detection._mapping import call_rows
+from kmn_jax.detection._polish import polish
+from kmn_jax.detection._refinement import refine_many, refine_one
+from kmn_jax.detection._scene import Scene
+from kmn_jax.detection._search import Candidates, SearchConfig, seed_keys
+from kmn_jax.detection._selection import Selection, select_poses
+from kmn_jax.detection._timing import Clock
+from kmn_jax.detection._verification import VERIFIED, verified
+
+_CONSIDERED = 128  # most probable poses that are compared with each other: one number, so one compilation
+_POINTS = 16  # on the surface, by which candidates are told apart
+_OTHER = 0.05  # diameters: a candidate that is nowhere farther from one that was refined would become the same pose
+
+
+class Choice(NamedTuple):
+    """Candidates, which of them stand, and how probable those are."""
+
+    candidates: Candidates
+    selection: Selection
+    probability: Float[np.ndarray, " s"]
+
+
+def choose_and_refine(
+    found: Candidates,
+    probabilities: Probabilities,
+    on_device: DevicePart,
+    scene: Scene,
+    random_seed: int,
+    config: DetectConfig,
+    search: SearchConfig,
+    clock: Clock,
+) -> Choice:
+    """Return refined candidates, and the choice among them; what was found as it is where nothing of it is chosen.
+
+    Refined are the most probable one of each place and a contender; then, up to `config.next_best` times, the next one
+    of each place where nothing has become sure; and in the end those that stand and are not sure, once more from where
+    they are.
+    """
+    with clock("selection"):
+        first = chosen(found, probabilities.found, on_device, config)
+    if not first.kept.any():
+        return Choice(found, first, probabilities.found.probability(found.evidence))
+
+    def refined(of: Candidates, which: Any, before: Candidates | None = None) -> Choice:
+        with clock("refinement"):
+            fine = refined_candidates(on_device, scene, of, np.flatnonzero(which), random_seed, search)
+        if before is not None:
+            fine = _together(before, fine)
+        with clock("selection"):
+            return Choice(fine, *reported(fine, probabilities, on_device, config, scene.is_narrowed))
+
+    rows = first.kept | first.contenders
+    best = refined(found, rows)
+    surface = np.asarray(on_device.arrays.points[:_POINTS])
+    places, left = _placed(found, surface), found.usable.copy()
+    for _ in range(config.next_best):
+        with clock("selection"):
+            left &= ~_near(places, places[rows], _OTHER * float(on_device.arrays.diameter))
+            sure = best.selection.kept & (best.probability >= config.sure)
+            centers, of_sure = (
+                of.mean(axis=1, keepdims=True) for of in (places, _placed(best.candidates, surface)[sure])
+            )
+            open_places = left & ~_near(centers, of_sure, float(on_device.reach))
+            rows = chosen(found._replace(usable=open_places), probabilities.found, on_device, config).kept
+        if not rows.any():
+            break
+        best = refined(found, rows, best.candidates)
+    doubtful = best.selection.kept & (best.probability < config.sure)
+    return refined(best.candidates, doubtful, best.candidates) if doubtful.any() else best
+
+
+def _placed(found: Candidates, surface: Float32[np.ndarray, "p 3"]) -> Float32[np.ndarray, "s p 3"]:
+    """Return points of the part at each candidate."""
+    return surface @ found.T_camera_object[:, :3, :3].swapaxes(1, 2) + found.T_camera_object[:, None, :3, 3]
+
+
+def _near(own: Float[np.ndarray, "s p 3"], others: Float[np.ndarray, "k p 3"], reach: float) -> Bool[np.ndarray, " s"]:
+    """Return which candidates have all of their points within `reach` of those of another one."""
+    near = np.zeros(len(own), dtype=bool)
+    for other in others:
+        near |= (((own - other) ** 2).sum(axis=2) <= reach**2).all(axis=1)
+    return near
+
+
+def _together(before: Candidates, more: Candidates) -> Candidates:
+    """Return candidates of the same crops as one."""
+    columns = ("T_camera_object", "usable", "evidence", "num_inliers", "crop")
+    both: dict[str, Any] = {name: np.concatenate([getattr(before, name), getattr(more, name)]) for name in columns}
+    return before._replace(**both)
+
+
+def refined_candidates(
+    on_device: DevicePart,
+    scene: Scene,
+    found: Candidates,
+    rows: Int[np.ndarray, " k"],
+    random_seed: int,
+    config: SearchConfig,
+) -> Candidates:
+    """Return some of the candidates refined on all points around them, and turned forms of them that fit as well.
+
+    The first k are the candidates themselves. All are polished, so that what is compared are the best poses of each
+    form, and have evidence of their own.
+    """
+    given = (on_device, scene.cloud, scene.image, config.crops.smooth, config.agreement)
+    seeds = found.seed_rows[found.crop[rows]]
+    poses, there = call_rows(
+        lambda pose, row, key: refine_one(pose, row, jax.random.wrap_key_data(key), *given),
+        lambda poses, rows, keys: refine_many(poses, rows, keys, *given),
+        found.T_camera_object[rows],
+        seeds.astype(np.int32),
+        seed_keys(seeds, random_seed),
+    )
+    poses = np.array(poses)
+    poses[there] = polish(poses[there], on_device, scene.image)
+    # The refined forms take the place of the poses of their crops.
+    forms = there.shape[1]
+    own = jax.tree.map(
+        lambda leaf: np.repeat(leaf.reshape(-1, *leaf.shape[2:])[rows, None], forms, axis=1),
+        (found.found.poses, found.found.scores),
+    )
+    wide = own[0]._replace(T_scene_object=poses, converged=there)
+    crops: CropPoses = jax.tree.map(lambda leaf: leaf[found.crop[rows]], found.found)
+    crops = crops._replace(poses=wide, scores=own[1])
+    agreement = config.agreement
+
+    def proof(crops: CropPoses) -> Float[jax.Array, "a f"]:
+        return gather_evidence(crops, on_device.arrays, on_device.surfels, scene.image, agreement)
+
+    evidence = np.array(call_rows(proof, jax.vmap(proof), crops))
+    evidence[there, EVIDENCE.index(VERIFIED)] = verified(poses[there], on_device, scene)
+    return Candidates(
+        _forms_first(poses),
+        _forms_first(there),
+        _forms_first(evidence),
+        _forms_first(wide.num_inliers),
+        np.tile(found.crop[rows], forms),
+        found.found,
+        found.seed_rows,
+    )
+
+
+def _forms_first(leaf: Any) -> np.ndarray:
+    """Return rows of forms (k, a, ...) one form after the other, (a * k, ...)."""
+    return np.swapaxes(leaf, 0, 1).reshape(-1, *leaf.shape[2:])
+
+
+def chosen(
+    found: Candidates,
+    calibration: Calibration,
+    part: DevicePart,
+    config: DetectConfig,
+    exact: Calibration | None = None,
+) -> Selection:
+    """Choose among the most probable candidates, by an `exact` model where there is one."""
+    probability = np.zeros(len(found.usable))
+    probability[found.usable] = calibration.probability(found.evidence[found.usable])
+    possible = found.usable & (probability >= config.reported)
+    ranked = np.argsort(-np.where(possible, probability, -1), kind="stable")[:_CONSIDERED]
+    rows = np.pad(ranked, (0, _CONSIDERED - len(ranked)), mode="edge")
+    usable = possible[rows] & (np.arange(_CONSIDERED) < len(ranked))
+    poses = found.T_camera_object[rows]
+    score = probability.copy()
+    if exact is not None:
+        score[possible] = exact.probability(found.evidence[possible])
+    given = jax.device_put((poses, score[rows].astype(np.float32), usable))
+    few: Selection = jax.device_get(select_poses(given[0], given[1], given[2], part))
+
+    def of_all(values: Any) -> Any:
+        result = np.zeros(len(possible), dtype=values.dtype)
+        result[ranked] = values[: len(ranked)]
+        return result
+
+    return Selection(*map(of_all, few))
+
+
+def reported(
+    refined: Candidates, probabilities: Probabilities, part: DevicePart, config: DetectConfig, is_narrowed: bool
+) -> tuple[Selection, Float[np.ndarray, " s"]]:
+    """Choose among refined candidates, and return also how probable those that stand are, given each other."""
+    choice = chosen(refined, probabilities.refined, part, config, probabilities.exact)
+    probability = np.zeros(len(choice.kept))
+    probability[choice.kept] = probabilities.of_scene(refined.evidence[choice.kept], is_narrowed)
+    return choice, probability
