@@ -115,7 +115,7 @@ def test_settings_say_how_many_are_refined(monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(InputError, match="next_best = -1"):
         DetectConfig(next_best=-1)
     with pytest.raises(InputError, match="sure = 2"):
-        DetectConfig(sure=2)
+        DetectConfig(sure=2.0)
 
 
 def test_where_nothing_is_probable_nothing_is_refined(monkeypatch: pytest.MonkeyPatch) -> None:
