@@ -60,16 +60,16 @@ def choose_and_refine(
     if not first.kept.any():
         return Choice(found, first, probabilities.found.probability(found.evidence))
 
-    def refined(of: Candidates, which: Any, before: Candidates | None = None) -> Choice:
+    def refined(of: Candidates, rows: Int[np.ndarray, " k"]) -> Candidates:
         with clock("refinement"):
-            fine = refined_candidates(on_device, scene, of, np.flatnonzero(which), random_seed, search)
-        if before is not None:
-            fine = _together(before, fine)
+            return refined_candidates(on_device, scene, of, rows, random_seed, search)
+
+    def judged(fine: Candidates) -> Choice:
         with clock("selection"):
             return Choice(fine, *reported(fine, probabilities, on_device, config, scene.is_narrowed))
 
-    rows = first.kept | first.contenders
-    best = refined(found, rows)
+    rows = np.flatnonzero(first.kept | first.contenders)
+    best, tried = judged(refined(found, rows)), [rows]
     surface = np.asarray(on_device.arrays.points[:_POINTS])
     places, left = _placed(found, surface), found.usable.copy()
     for _ in range(config.next_best):
@@ -80,12 +80,20 @@ def choose_and_refine(
                 of.mean(axis=1, keepdims=True) for of in (places, _placed(best.candidates, surface)[sure])
             )
             open_places = left & ~_near(centers, of_sure, float(on_device.reach))
-            rows = chosen(found._replace(usable=open_places), probabilities.found, on_device, config).kept
-        if not rows.any():
+            again = chosen(found._replace(usable=open_places), probabilities.found, on_device, config)
+        rows = np.flatnonzero(again.kept)
+        if not len(rows):
             break
-        best = refined(found, rows, best.candidates)
-    doubtful = best.selection.kept & (best.probability < config.sure)
-    return refined(best.candidates, doubtful, best.candidates) if doubtful.any() else best
+        best = judged(_together(best.candidates, refined(found, rows)))
+        tried.append(rows)
+    doubtful = np.flatnonzero(best.selection.kept & (best.probability < config.sure))
+    if not len(doubtful):
+        return best
+    forms = len(best.candidates.usable) // sum(map(len, tried))
+    rows = np.concatenate([np.tile(some, forms) for some in tried])[doubtful]  # that they were made of
+    poses = found.T_camera_object.copy()
+    poses[rows] = best.candidates.T_camera_object[doubtful]
+    return judged(_together(best.candidates, refined(found._replace(T_camera_object=poses), rows)))
 
 
 def _placed(found: Candidates, surface: Float32[np.ndarray, "p 3"]) -> Float32[np.ndarray, "s p 3"]:

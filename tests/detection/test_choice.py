@@ -55,12 +55,16 @@ def chosen(
     turns: list[list[int]] = []
 
     def refined(part: object, scene: object, of: Candidates, rows: np.ndarray, *given: object) -> Candidates:
+        """Move candidates away from the camera, and add a second form of each, which there is not."""
         numbers = of.num_inliers[rows].tolist()
         evidence = of.evidence[rows].copy()
         evidence[:, 1] = [become[number][sum(number in turn for turn in turns)] for number in numbers]
         turns.append(numbers)
-        columns = (of.T_camera_object[rows], of.usable[rows], evidence, of.num_inliers[rows], of.crop[rows])
-        return Candidates(*columns, of.found, of.seed_rows)
+        poses = of.T_camera_object[rows] + pose((0.0, 0.0, MOVE), np.zeros((3, 3))) * (np.arange(4) < 3)[:, None]
+        columns = (poses.astype(np.float32), of.usable[rows], evidence, of.num_inliers[rows], of.crop[rows])
+        both = [np.concatenate([column, column]) for column in columns]
+        both[1][len(rows) :] = False
+        return Candidates(both[0], both[1], both[2], both[3], both[4], of.found, of.seed_rows)
 
     monkeypatch.setattr(choosing, "refined_candidates", refined)
     return turns, choose_and_refine(found, MODELS, on_device(BOX), box_view(), 0, config, SearchConfig(), Clock())
@@ -74,6 +78,7 @@ def stand(choice: Choice) -> dict[int, float]:
     )
 
 
+MOVE = 0.001 * BOX.diameter
 APART = 0.06 * BOX.diameter  # what is so far apart is refined for itself, but is one place
 FAR = 9.0
 
@@ -94,10 +99,12 @@ def test_the_next_best_are_refined_until_one_is_sure(monkeypatch: pytest.MonkeyP
 
 
 def test_what_stays_doubtful_is_refined_once_more_from_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = candidates((0.0, 3.0), (APART, 0.0))
-    turns, choice = chosen(monkeypatch, found, {0: [1.0, 2.0], 1: [0.0]})
-    assert turns == [[0], [1], [0]]
-    assert stand(choice) == {0: 2.0}
+    found = candidates((0.0, 3.0), (APART, 0.0), (FAR, 4.0))
+    turns, choice = chosen(monkeypatch, found, {0: [1.0, 2.0], 1: [0.0], 2: [5.0]})
+    assert turns == [[0, 2], [1], [0]]
+    assert stand(choice) == {0: 2.0, 2: 5.0}
+    depth = choice.candidates.T_camera_object[choice.selection.kept, 2, 3]
+    assert sorted(depth.tolist()) == pytest.approx([9.0 + MOVE, 9.0 + 2 * MOVE])
 
 
 def test_what_would_become_the_same_pose_or_is_hardly_probable_is_not_refined(monkeypatch: pytest.MonkeyPatch) -> None:
