@@ -6,7 +6,7 @@ Open3D's FPFH and RANSAC get the same crops; their poses are counted and timed w
 all methods of an evaluation share, ours with the refinement of the same call.
 
 A crop's stages are one compiled call, a bin's too: depth image in, ranked poses out. Beside a bin's call stands the
-search in rounds of `PoseEstimator.detect`, which refines on more points and compares turned forms of each pose.
+search in rounds of `PoseEstimator.detect`, which refines more poses, on more points, and compares turned forms of each.
 """
 
 from __future__ import annotations

@@ -50,8 +50,8 @@ _OUTSIDE = get_opaque_trace_state(convention="nnx")  # of all traces, as Flax te
 def keep_compiled() -> None:
     """Keep programs between processes, in the user's cache, or where JAX_COMPILATION_CACHE_DIR says.
 
-    Without a home, or with one that cannot be written to, nothing is kept; what a folder holds is used though it cannot
-    be written to.
+    Without a home, or with one that cannot be written to, nothing is kept. What cannot be read from, or written to, a
+    folder that is named is compiled without a word: JAX would warn for each program.
     """
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         with contextlib.suppress(OSError, RuntimeError):
@@ -59,7 +59,7 @@ def keep_compiled() -> None:
             folder.mkdir(parents=True, exist_ok=True)
             if os.access(folder, os.W_OK):
                 jax.config.update("jax_compilation_cache_dir", str(folder))
-    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")  # which costs time
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     chosen = jax.config.values["jax_compilation_cache_dir"]
     if chosen:

@@ -28,7 +28,10 @@ from kmn_jax.detection._verification import VERIFIED, verified
 
 _CONSIDERED = 128  # most probable poses that are compared with each other: one number, so one compilation
 _POINTS = 16  # on the surface, by which candidates are told apart
-_OTHER = 0.05  # diameters: a candidate that is nowhere farther from one that was refined would become the same pose
+_OTHER = (
+    0.05  # diameters: nowhere farther from one that was refined, a candidate would become the same; turns that look
+)
+# the same count as others
 
 
 class Choice(NamedTuple):
@@ -52,25 +55,25 @@ def choose_and_refine(
     """Return refined candidates, and the choice among them; what was found as it is where nothing of it is chosen.
 
     Refined are the most probable one of each place and a contender; then, up to `config.next_best` times, the next one
-    of each place where nothing has become sure; and in the end those that stand and are not sure, once more from where
-    they are.
+    of each place, but for places about as far from a sure pose as poses of one copy may be; and in the end those that
+    stand and are not sure, once more from where they are. `search` is `config.search` of the network.
     """
     with clock("selection"):
         first = chosen(found, probabilities.found, on_device, config)
     if not first.kept.any():
         return Choice(found, first, probabilities.found.probability(found.evidence))
 
-    def refined(of: Candidates, rows: Int[np.ndarray, " k"]) -> Candidates:
+    def refined(rows: Int[np.ndarray, " k"], starts: Float32[np.ndarray, "k 4 4"] | None = None) -> Candidates:
         with clock("refinement"):
-            return refined_candidates(on_device, scene, of, rows, random_seed, search)
+            return refined_candidates(on_device, scene, found, rows, random_seed, search, starts)
 
     def judged(fine: Candidates) -> Choice:
         with clock("selection"):
             return Choice(fine, *reported(fine, probabilities, on_device, config, scene.is_narrowed))
 
     rows = np.flatnonzero(first.kept | first.contenders)
-    best, tried = judged(refined(found, rows)), [rows]
-    surface = np.asarray(on_device.arrays.points[:_POINTS])
+    best, tried = judged(refined(rows)), [rows]
+    surface = np.asarray(on_device.arrays.points)[:_POINTS]
     places, left = _placed(found, surface), found.usable.copy()
     for _ in range(config.next_best):
         with clock("selection"):
@@ -84,16 +87,14 @@ def choose_and_refine(
         rows = np.flatnonzero(again.kept)
         if not len(rows):
             break
-        best = judged(_together(best.candidates, refined(found, rows)))
+        best = judged(_together(best.candidates, refined(rows)))
         tried.append(rows)
     doubtful = np.flatnonzero(best.selection.kept & (best.probability < config.sure))
     if not len(doubtful):
         return best
     forms = len(best.candidates.usable) // sum(map(len, tried))
     rows = np.concatenate([np.tile(some, forms) for some in tried])[doubtful]  # that they were made of
-    poses = found.T_camera_object.copy()
-    poses[rows] = best.candidates.T_camera_object[doubtful]
-    return judged(_together(best.candidates, refined(found._replace(T_camera_object=poses), rows)))
+    return judged(_together(best.candidates, refined(rows, best.candidates.T_camera_object[doubtful])))
 
 
 def _placed(found: Candidates, surface: Float32[np.ndarray, "p 3"]) -> Float32[np.ndarray, "s p 3"]:
@@ -123,18 +124,20 @@ def refined_candidates(
     rows: Int[np.ndarray, " k"],
     random_seed: int,
     config: SearchConfig,
+    starts: Float32[np.ndarray, "k 4 4"] | None = None,
 ) -> Candidates:
     """Return some of the candidates refined on all points around them, and turned forms of them that fit as well.
 
-    The first k are the candidates themselves. All are polished, so that what is compared are the best poses of each
-    form, and have evidence of their own.
+    It begins where they are, or at other poses, `starts`, around the same seeds. The first k are the candidates
+    themselves. All are polished, so that what is compared are the best poses of each form, and have evidence of their
+    own.
     """
     given = (on_device, scene.cloud, scene.image, config.crops.smooth, config.agreement)
     seeds = found.seed_rows[found.crop[rows]]
     poses, there = call_rows(
         lambda pose, row, key: refine_one(pose, row, jax.random.wrap_key_data(key), *given),
         lambda poses, rows, keys: refine_many(poses, rows, keys, *given),
-        found.T_camera_object[rows],
+        found.T_camera_object[rows] if starts is None else starts,
         seeds.astype(np.int32),
         seed_keys(seeds, random_seed),
     )

@@ -26,7 +26,7 @@ class DetectConfig:
     accepted: float = 0.8  # that from which on a pose counts as found: in world bins 95% of such poses are right
     reported: float = 0.1  # less probable poses are left out
     next_best: int = 4  # poses of a place that are refined, one after the other, as long as none of it is sure
-    sure: float = 0.9  # the probability from which on a refined pose is
+    sure: float = 0.9  # the probability from which on a refined pose is; others that stand are refined once more
 
     def __post_init__(self) -> None:
         if self.patience is not None and self.patience < 1:

@@ -48,23 +48,33 @@ def candidates(*rows: tuple[float, float]) -> Candidates:
     return Candidates(poses, np.ones(len(rows), dtype=bool), evidence, count, count, nothing, count)
 
 
-def chosen(
-    monkeypatch: pytest.MonkeyPatch, found: Candidates, become: dict[int, list[float]], config: DetectConfig = CONFIG
+def refine(
+    monkeypatch: pytest.MonkeyPatch,
+    found: Candidates,
+    become: dict[int, list[float]],
+    config: DetectConfig = CONFIG,
+    turned: dict[int, float] | None = None,
 ) -> tuple[list[list[int]], Choice]:
-    """Return which candidates are refined in each turn, and the choice; `become` are their log odds, each time."""
+    """Return which candidates are refined in each turn, and the choice.
+
+    `become` are their log odds, each time that they are refined, `turned` those of another form of some.
+    """
     turns: list[list[int]] = []
 
-    def refined(part: object, scene: object, of: Candidates, rows: np.ndarray, *given: object) -> Candidates:
-        """Move candidates away from the camera, and add a second form of each, which there is not."""
+    def refined(
+        part: object, scene: object, of: Candidates, rows: np.ndarray, seed: int, search: object, starts: Any = None
+    ) -> Candidates:
+        """Move candidates away from the camera, those of another form twice as far."""
         numbers = of.num_inliers[rows].tolist()
-        evidence = of.evidence[rows].copy()
-        evidence[:, 1] = [become[number][sum(number in turn for turn in turns)] for number in numbers]
+        evidence = np.tile(of.evidence[rows], (2, 1))
+        own = [become[number][sum(number in turn for turn in turns)] for number in numbers]
+        evidence[:, 1] = [*own, *((turned or {}).get(number, 0.0) for number in numbers)]
+        usable = np.array([*(True for _ in numbers), *(number in (turned or {}) for number in numbers)])
         turns.append(numbers)
-        poses = of.T_camera_object[rows] + pose((0.0, 0.0, MOVE), np.zeros((3, 3))) * (np.arange(4) < 3)[:, None]
-        columns = (poses.astype(np.float32), of.usable[rows], evidence, of.num_inliers[rows], of.crop[rows])
-        both = [np.concatenate([column, column]) for column in columns]
-        both[1][len(rows) :] = False
-        return Candidates(both[0], both[1], both[2], both[3], both[4], of.found, of.seed_rows)
+        poses = np.tile(of.T_camera_object[rows] if starts is None else starts, (2, 1, 1))
+        poses[:, 2, 3] += np.repeat([MOVE, 2 * MOVE], len(rows))
+        columns = (np.tile(of.num_inliers[rows], 2), np.tile(of.crop[rows], 2))
+        return Candidates(poses, usable, evidence, *columns, of.found, of.seed_rows)
 
     monkeypatch.setattr(choosing, "refined_candidates", refined)
     return turns, choose_and_refine(found, MODELS, on_device(BOX), box_view(), 0, config, SearchConfig(), Clock())
@@ -85,14 +95,14 @@ FAR = 9.0
 
 def test_where_all_become_sure_no_others_are_refined(monkeypatch: pytest.MonkeyPatch) -> None:
     found = candidates((0.0, 3.0), (APART, 0.0), (FAR, 3.0), (FAR + APART, 0.0))
-    turns, choice = chosen(monkeypatch, found, {0: [4.0], 2: [5.0]})
+    turns, choice = refine(monkeypatch, found, {0: [4.0], 2: [5.0]})
     assert turns == [[0, 2]]
     assert stand(choice) == {0: 4.0, 2: 5.0}
 
 
 def test_the_next_best_are_refined_until_one_is_sure(monkeypatch: pytest.MonkeyPatch) -> None:
     found = candidates((0.0, 3.0), (APART, 0.5), (2 * APART, 0.0), (-APART, -0.5), (FAR, 3.0), (FAR + APART, 0.0))
-    turns, choice = chosen(monkeypatch, found, {0: [0.0], 1: [-1.0], 2: [3.0], 4: [4.0]})
+    turns, choice = refine(monkeypatch, found, {0: [0.0], 1: [-1.0], 2: [3.0], 4: [4.0]})
     assert turns == [[0, 4], [1], [2]]
     assert stand(choice) == {2: 3.0, 4: 4.0}
     assert choice.probability[choice.selection.kept] == pytest.approx(1 / (1 + np.exp([-4.0, -3.0])))
@@ -100,25 +110,35 @@ def test_the_next_best_are_refined_until_one_is_sure(monkeypatch: pytest.MonkeyP
 
 def test_what_stays_doubtful_is_refined_once_more_from_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     found = candidates((0.0, 3.0), (APART, 0.0), (FAR, 4.0))
-    turns, choice = chosen(monkeypatch, found, {0: [1.0, 2.0], 1: [0.0], 2: [5.0]})
+    turns, choice = refine(monkeypatch, found, {0: [1.0, 2.0], 1: [0.0], 2: [5.0]})
     assert turns == [[0, 2], [1], [0]]
     assert stand(choice) == {0: 2.0, 2: 5.0}
     depth = choice.candidates.T_camera_object[choice.selection.kept, 2, 3]
     assert sorted(depth.tolist()) == pytest.approx([9.0 + MOVE, 9.0 + 2 * MOVE])
 
 
+def test_forms_of_candidates_that_were_refined_later_are_known_by_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = candidates((0.0, 3.0), (FAR, 2.0), (APART, 0.0), (FAR + APART, -0.5))
+    become = {0: [0.0], 1: [0.1], 2: [0.2, 0.3], 3: [0.4, 2.0]}
+    turns, choice = refine(monkeypatch, found, become, turned={3: 1.0})
+    assert turns == [[0, 1], [2, 3], [2, 3]]
+    assert stand(choice) == pytest.approx({2: 0.3, 3: 2.0})
+    depth = choice.candidates.T_camera_object[choice.selection.kept, 2, 3]
+    assert depth.tolist() == pytest.approx([9.0 + 2 * MOVE, 9.0 + 3 * MOVE])
+
+
 def test_what_would_become_the_same_pose_or_is_hardly_probable_is_not_refined(monkeypatch: pytest.MonkeyPatch) -> None:
     found = candidates((0.0, 3.0), (0.02 * BOX.diameter, 1.0), (APART, -4.0))
-    turns, _ = chosen(monkeypatch, found, {0: [0.0, 0.0]})
+    turns, _ = refine(monkeypatch, found, {0: [0.0, 0.0]})
     assert turns == [[0], [0]]
 
 
 def test_settings_say_how_many_are_refined(monkeypatch: pytest.MonkeyPatch) -> None:
     found = candidates((0.0, 4.0), (APART, 3.0), (-APART, 2.0), (2 * APART, 1.0))
     become = {number: [0.0, 0.0] for number in range(4)}
-    assert chosen(monkeypatch, found, become, replace(CONFIG, next_best=1))[0] == [[0], [1], [0]]
-    assert chosen(monkeypatch, found, become, replace(CONFIG, next_best=0, sure=0.0))[0] == [[0]]
-    assert len(chosen(monkeypatch, found, become)[0]) == 5
+    assert refine(monkeypatch, found, become, replace(CONFIG, next_best=1))[0] == [[0], [1], [0]]
+    assert refine(monkeypatch, found, become, replace(CONFIG, next_best=0, sure=0.0))[0] == [[0]]
+    assert len(refine(monkeypatch, found, become)[0]) == 5
     with pytest.raises(InputError, match="next_best = -1"):
         DetectConfig(next_best=-1)
     with pytest.raises(InputError, match="sure = 2"):
@@ -127,7 +147,7 @@ def test_settings_say_how_many_are_refined(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_where_nothing_is_probable_nothing_is_refined(monkeypatch: pytest.MonkeyPatch) -> None:
     found = candidates((0.0, -5.0), (FAR, -6.0))
-    turns, choice = chosen(monkeypatch, found, {})
+    turns, choice = refine(monkeypatch, found, {})
     assert turns == []
     assert not choice.selection.kept.any()
     assert choice.probability == pytest.approx(1 / (1 + np.exp([5.0, 6.0])))
