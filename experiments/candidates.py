@@ -234,7 +234,7 @@ def side_by_side(function: Callable[[_Item], _Made], items: Iterable[_Item], at_
 def _due(
     found: Candidates, chooser: Calibration, on_device: DevicePart, rows: Int[np.ndarray, " k"], fine: Candidates
 ) -> Bool[np.ndarray, " s"]:
-    """Return of the poses that some candidates, in `rows`, became whether detection refines these candidates first."""
+    """Return of the poses that some candidates, in `rows`, became whether detection refines these candidates."""
     choice = chosen(found, chooser, on_device, DetectConfig())
     due = (choice.kept | choice.contenders)[rows]
     return np.tile(due, len(fine.usable) // len(rows))[fine.usable]
@@ -298,9 +298,7 @@ def _check(is_same: bool) -> None:
 
 
 def _with_reported(poses: Columns, searched: dict[int, DevicePart], fits: FitOptions) -> Columns:
-    """Return poses with what detection would report of each search, if it refined the best of each place alone, by
-    models that do not know the image's object.
-    """
+    """Return poses with what detection reports of each search, by models that do not know the image's object."""
     none = np.zeros(len(poses["error"]), dtype=bool)  # it is not known yet, or that of other evidence
     fine = {name: values[poses["refined"]] for name, values in (poses | {"reported": none}).items()}
     others, exact = (_models(rows, fits) for rows in (fine, by_largest_error(fine)))

@@ -26,7 +26,7 @@ from tests.detection.box_sample import box_view
 from tests.detection.test_selection import BOX, on_device
 from tests.reference.meshes import pose
 
-CONFIG = DetectConfig()
+CONFIG = DetectConfig(next_best=4, sure=0.9)
 
 
 def by(column: int) -> Calibration:
@@ -137,7 +137,7 @@ def test_settings_say_how_many_are_refined(monkeypatch: pytest.MonkeyPatch) -> N
     found = candidates((0.0, 4.0), (APART, 3.0), (-APART, 2.0), (2 * APART, 1.0))
     become = {number: [0.0, 0.0] for number in range(4)}
     assert refine(monkeypatch, found, become, replace(CONFIG, next_best=1))[0] == [[0], [1], [0]]
-    assert refine(monkeypatch, found, become, replace(CONFIG, next_best=0, sure=0.0))[0] == [[0]]
+    assert refine(monkeypatch, found, become, DetectConfig())[0] == [[0]]
     assert len(refine(monkeypatch, found, become)[0]) == 5
     with pytest.raises(InputError, match="next_best = -1"):
         DetectConfig(next_best=-1)
