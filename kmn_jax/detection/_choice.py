@@ -1,7 +1,7 @@
-"""Which candidates are refined, and which of them stand: the best of each place and, while it is doubtful, others.
+"""Which candidates are refined, and which of them stand: the best of each place and, where that is asked for, others.
 
 What is said of a pose as it was found is rough: of several in one place, another one may become the better pose once
-all are refined. So more of them are refined wherever none has become a sure one.
+all are refined. So `DetectConfig.next_best` refines more of them where none has become a sure one.
 """
 
 from __future__ import annotations
@@ -28,10 +28,7 @@ from kmn_jax.detection._verification import VERIFIED, verified
 
 _CONSIDERED = 128  # most probable poses that are compared with each other: one number, so one compilation
 _POINTS = 16  # on the surface, by which candidates are told apart
-_OTHER = (
-    0.05  # diameters: nowhere farther from one that was refined, a candidate would become the same; turns that look
-)
-# the same count as others
+_OTHER = 0.05  # diameters: a candidate that is nowhere farther from one that was refined would become the same pose
 
 
 class Choice(NamedTuple):
@@ -73,18 +70,10 @@ def choose_and_refine(
 
     rows = np.flatnonzero(first.kept | first.contenders)
     best, tried = judged(refined(rows)), [rows]
-    surface = np.asarray(on_device.arrays.points)[:_POINTS]
-    places, left = _placed(found, surface), found.usable.copy()
     for _ in range(config.next_best):
         with clock("selection"):
-            left &= ~_near(places, places[rows], _OTHER * float(on_device.arrays.diameter))
-            sure = best.selection.kept & (best.probability >= config.sure)
-            centers, of_sure = (
-                of.mean(axis=1, keepdims=True) for of in (places, _placed(best.candidates, surface)[sure])
-            )
-            open_places = left & ~_near(centers, of_sure, float(on_device.reach))
-            again = chosen(found._replace(usable=open_places), probabilities.found, on_device, config)
-        rows = np.flatnonzero(again.kept)
+            left = _left(found, np.concatenate(tried), best, on_device, config.sure)
+            rows = np.flatnonzero(chosen(left, probabilities.found, on_device, config).kept)
         if not len(rows):
             break
         best = judged(_together(best.candidates, refined(rows)))
@@ -95,6 +84,23 @@ def choose_and_refine(
     forms = len(best.candidates.usable) // sum(map(len, tried))
     rows = np.concatenate([np.tile(some, forms) for some in tried])[doubtful]  # that they were made of
     return judged(_together(best.candidates, refined(rows, best.candidates.T_camera_object[doubtful])))
+
+
+def _left(
+    found: Candidates, tried: Int[np.ndarray, " k"], best: Choice, on_device: DevicePart, sure: float
+) -> Candidates:
+    """Return candidates, of which those are usable that are like none that was tried, nor in the place of a sure pose.
+
+    Turns under which the part looks the same count as others.
+    """
+    surface = np.asarray(on_device.arrays.points)[:_POINTS]
+    places = _placed(found, surface)
+    is_sure = best.selection.kept & (best.probability >= sure)
+    centers, sure_centers = (
+        of.mean(axis=1, keepdims=True) for of in (places, _placed(best.candidates, surface)[is_sure])
+    )
+    done = _near(places, places[tried], _OTHER * float(on_device.arrays.diameter))
+    return found._replace(usable=found.usable & ~done & ~_near(centers, sure_centers, float(on_device.reach)))
 
 
 def _placed(found: Candidates, surface: Float32[np.ndarray, "p 3"]) -> Float32[np.ndarray, "s p 3"]:
