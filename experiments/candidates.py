@@ -30,6 +30,7 @@ from kmn_jax.detection import (
     DetectConfig,
     DevicePart,
     SearchConfig,
+    best_left,
     chosen,
     explore,
     picture_evidence,
@@ -43,7 +44,8 @@ from kmn_jax.files import make_folder, write_whole
 from kmn_jax.models import Model
 from kmn_jax.objects import model_digest
 
-_LOOSE = DetectConfig(reported=0.03)  # refines more than detection does, so that the fit sees what is just refused
+_CONFIG = DetectConfig(next_best=4, sure=0.9)  # of the detection that probabilities are for
+_LOOSE = replace(_CONFIG, reported=0.03)  # refines more than that does, so that the fit sees what is just refused
 _COLUMNS = (  # of what is stored
     "evidence",
     "error",
@@ -54,10 +56,11 @@ _COLUMNS = (  # of what is stored
     "narrowed",
     "T_camera_object",
     "refined",
-    "due",  # whether they are of what detection chooses among, which refines less
+    "turn",  # of which they are of what detection refines; none, -1, is of poses as they were found and of others
+    "due",  # whether they are of what detection chooses among: the first turn, and others where nothing was sure
     "reported",
 )
-_HOW = 8  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
+_HOW = 9  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
 _IN_MEMORY = 600  # searches, of each of which what was found first, crops and all, takes 10 MB
 _AT_ONCE = 2  # searches: one alone leaves a part of two cores idle
 _Item = TypeVar("_Item")
@@ -141,7 +144,7 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
     stays as it is, chosen by the models of when it was refined: of images that were built anew make another one. Raises
     InputError if the folder is of other weights or settings.
     """
-    config = DetectConfig().search_of(network.config)
+    config = _CONFIG.search_of(network.config)
     first: dict[int, Candidates] = {}
     kept = _Kept(folder, repr((_HOW, SEARCHED, sources.method, *_settings(fits, network), EVIDENCE)))
     at_once = 1 if sources.method == "FPFH" else _AT_ONCE  # whose random numbers are those of the whole process
@@ -158,7 +161,7 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
     found_parts = side_by_side(partial(kept.made, "found", found_first), searches(sources, network), at_once)
     poses = _joined(found_parts)
     none = np.zeros(len(poses["error"]), dtype=bool)
-    poses |= {"refined": none, "due": none, "reported": none}
+    poses |= {"refined": none, "turn": np.full(len(none), -1), "reported": none}
     others, of_all = _models(poses, fits), model_of(poses, fits)
     searched: dict[int, DevicePart] = {}
 
@@ -166,16 +169,15 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
         found = first.pop(search.row, None) or propose(search)(_first_seeds(search))
         chooser = others.get(search.number, of_all)  # of an object without poses no model knows anything
         found = _explored(search, _going_on(found, propose(search)), chooser)
-        choice = chosen(found, chooser, search.on_device, _LOOSE)
-        rows = np.flatnonzero(choice.kept | choice.contenders)
+        rows, turns = _turns(found, chooser, search.on_device)
         if not len(rows):
-            return search.columns(found._replace(usable=np.zeros_like(found.usable))) | {"due": np.zeros(0, dtype=bool)}
+            return search.columns(found._replace(usable=np.zeros_like(found.usable))) | {"turn": turns}
         fine = refined_candidates(search.on_device, search.scene, found, rows, 0, config)
-        return search.columns(fine) | {"due": _due(found, chooser, search.on_device, rows, fine)}
+        return search.columns(fine) | {"turn": np.tile(turns, len(fine.usable) // len(rows))[fine.usable]}
 
     def refined_part(search: Search) -> Columns:
         found = kept.made("refined", refined, search)
-        if found and found["due"].any():
+        if found and (found["turn"] >= 0).any():
             searched[search.row] = search.on_device
         return found
 
@@ -231,13 +233,25 @@ def side_by_side(function: Callable[[_Item], _Made], items: Iterable[_Item], at_
             raise
 
 
-def _due(
-    found: Candidates, chooser: Calibration, on_device: DevicePart, rows: Int[np.ndarray, " k"], fine: Candidates
-) -> Bool[np.ndarray, " s"]:
-    """Return of the poses that some candidates, in `rows`, became whether detection refines these candidates."""
-    choice = chosen(found, chooser, on_device, DetectConfig())
-    due = (choice.kept | choice.contenders)[rows]
-    return np.tile(due, len(fine.usable) // len(rows))[fine.usable]
+def _turns(
+    found: Candidates, chooser: Calibration, on_device: DevicePart
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Return the rows of candidates to refine, and the turn in which detection would, if nothing became a sure pose.
+
+    Those that are just not probable enough for detection, of which there is one turn, are -1.
+    """
+    loose, first = (chosen(found, chooser, on_device, config) for config in (_LOOSE, _CONFIG))
+    due = first.kept | first.contenders
+    rows = [np.flatnonzero(due), np.flatnonzero((loose.kept | loose.contenders) & ~due)]
+    turns = [np.full(len(rows[0]), 0), np.full(len(rows[1]), -1)]
+    none = np.zeros((0, 4, 4), dtype=np.float32)
+    tried = rows[0]
+    for turn in range(1, 1 + _CONFIG.next_best):
+        more = best_left(found, tried, none, chooser, on_device, _CONFIG)
+        tried = np.concatenate([tried, more])
+        rows.append(more)
+        turns.append(np.full(len(more), turn))
+    return np.concatenate(rows), np.concatenate(turns)
 
 
 def judged_anew(poses: Columns, names: tuple[str, ...], sources: Sources, fits: FitOptions, network: Model) -> Columns:
@@ -252,7 +266,7 @@ def judged_anew(poses: Columns, names: tuple[str, ...], sources: Sources, fits: 
     for column, name in enumerate(EVIDENCE):
         if name not in made:
             evidence[:, column] = poses["evidence"][:, names.index(name)]
-    config = DetectConfig().search_of(network.config)
+    config = _CONFIG.search_of(network.config)
     searched: dict[int, DevicePart] = {}
     all_of_picture = not made.isdisjoint(PICTURE_EVIDENCE)
     of_picture = np.array([EVIDENCE.index(name) for name in PICTURE_EVIDENCE])
@@ -298,18 +312,43 @@ def _check(is_same: bool) -> None:
 
 
 def _with_reported(poses: Columns, searched: dict[int, DevicePart], fits: FitOptions) -> Columns:
-    """Return poses with what detection reports of each search, by models that do not know the image's object."""
+    """Return poses with what detection refines and reports, by models that do not know the image's object."""
     none = np.zeros(len(poses["error"]), dtype=bool)  # it is not known yet, or that of other evidence
     fine = {name: values[poses["refined"]] for name, values in (poses | {"reported": none}).items()}
     others, exact = (_models(rows, fits) for rows in (fine, by_largest_error(fine)))
-    reported = none.copy()
+    due, reported = none.copy(), none.copy()
     for row, on_device in searched.items():
-        rows = np.flatnonzero((poses["search"] == row) & poses["due"])
+        rows = np.flatnonzero((poses["search"] == row) & (poses["turn"] >= 0))
         if len(rows):
             number = int(poses["object"][rows[0]])
             found = _choosable(poses["T_camera_object"][rows], poses["evidence"][rows])
-            reported[rows] = chosen(found, others[number], on_device, DetectConfig(), exact[number]).kept
-    return poses | {"reported": reported}
+            kept, among = _chosen_in_turns(found, poses["turn"][rows], others[number], exact[number], on_device)
+            due[rows], reported[rows] = among, kept
+    return poses | {"due": due, "reported": reported}
+
+
+def _chosen_in_turns(
+    found: Candidates, turns: Int[np.ndarray, " s"], model: Calibration, exact: Calibration, on_device: DevicePart
+) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
+    """Return which refined poses detection reports, and among which it chooses.
+
+    It does not come to later ones near a sure pose; near is what has its middle no farther than poses of one copy have.
+    """
+
+    def kept_of(rows: Bool[np.ndarray, " s"]) -> Bool[np.ndarray, " s"]:
+        return np.asarray(chosen(found._replace(usable=rows), model, on_device, _CONFIG, exact).kept)
+
+    due = turns == 0
+    kept = kept_of(due)
+    if (turns <= 0).all():
+        return kept, due
+    is_sure = model.probability(found.evidence) >= _CONFIG.sure
+    middles = found.T_camera_object @ np.append(np.asarray(on_device.arrays.points).mean(axis=0), 1)
+    for turn in range(1, 1 + turns.max()):
+        away = np.linalg.norm(middles[:, None] - middles[kept & is_sure], axis=2)
+        due |= (turns == turn) & (away > float(on_device.reach)).all(axis=1)
+        kept = kept_of(due)
+    return kept, due
 
 
 def _models(poses: Columns, fits: FitOptions) -> dict[int, Calibration]:
@@ -354,7 +393,7 @@ def _explored(
     search: Search, propose: Callable[[Int[np.ndarray, " c"]], Candidates], chooser: Calibration
 ) -> Candidates:
     """Return the poses that detection finds in all of its rounds."""
-    return explore(search.scene, search.part, propose, chooser, DetectConfig(), Clock())[0]
+    return explore(search.scene, search.part, propose, chooser, _CONFIG, Clock())[0]
 
 
 def _made_of(sources: Sources, fits: FitOptions, network: Model) -> str:
@@ -365,4 +404,4 @@ def _made_of(sources: Sources, fits: FitOptions, network: Model) -> str:
 
 def _settings(fits: FitOptions, network: Model) -> tuple[Any, ...]:
     decisive = fits.folds, fits.members, fits.absent_weight, TREE_SETTINGS  # for what is refined and reported
-    return decisive, model_digest(network), DetectConfig(), DetectConfig().search_of(network.config), _LOOSE
+    return decisive, model_digest(network), _CONFIG, _CONFIG.search_of(network.config), _LOOSE

@@ -18,7 +18,7 @@ from kmn_jax.detection._calibration import (
     vouched,
 )
 from kmn_jax.detection._canonical import canonical_pose
-from kmn_jax.detection._choice import Choice, choose_and_refine, chosen, refined_candidates, reported
+from kmn_jax.detection._choice import Choice, best_left, choose_and_refine, chosen, refined_candidates, reported
 from kmn_jax.detection._config import FAST, THOROUGH, DetectConfig, Effort, config_of
 from kmn_jax.detection._coverage import near_surface
 from kmn_jax.detection._crop_search import (
@@ -136,6 +136,7 @@ __all__ = [
     "Timing",
     "as_json",
     "away_from_empty",
+    "best_left",
     "bin_content",
     "bin_poses",
     "calibration_beside",

@@ -29,6 +29,8 @@ from kmn_jax.detection._verification import VERIFIED, verified
 _CONSIDERED = 128  # most probable poses that are compared with each other: one number, so one compilation
 _POINTS = 16  # on the surface, by which candidates are told apart
 _OTHER = 0.05  # diameters: a candidate that is nowhere farther from one that was refined would become the same pose
+_APART = 2 * _OTHER  # centres of mass of such candidates, as sampled, are no farther apart
+_SURE = 2.0  # a score above all probabilities
 
 
 class Choice(NamedTuple):
@@ -52,8 +54,8 @@ def choose_and_refine(
     """Return refined candidates, and the choice among them; what was found as it is where nothing of it is chosen.
 
     Refined are the most probable one of each place and a contender; then, up to `config.next_best` times, the next one
-    of each place, but for places about as far from a sure pose as poses of one copy may be; and in the end those that
-    stand and are not sure, once more from where they are. `search` is `config.search` of the network.
+    of each place where no sure pose stands; and in the end those that stand and are not sure, once more from where they
+    are. `search` is `config.search` of the network.
     """
     with clock("selection"):
         first = chosen(found, probabilities.found, on_device, config)
@@ -72,8 +74,8 @@ def choose_and_refine(
     best, tried = judged(refined(rows)), [rows]
     for _ in range(config.next_best):
         with clock("selection"):
-            left = _left(found, np.concatenate(tried), best, on_device, config.sure)
-            rows = np.flatnonzero(chosen(left, probabilities.found, on_device, config).kept)
+            sure = best.candidates.T_camera_object[best.selection.kept & (best.probability >= config.sure)]
+            rows = best_left(found, np.concatenate(tried), sure, probabilities.found, on_device, config)
         if not len(rows):
             break
         best = judged(_together(best.candidates, refined(rows)))
@@ -86,34 +88,49 @@ def choose_and_refine(
     return judged(_together(best.candidates, refined(rows, best.candidates.T_camera_object[doubtful])))
 
 
-def _left(
-    found: Candidates, tried: Int[np.ndarray, " k"], best: Choice, on_device: DevicePart, sure: float
-) -> Candidates:
-    """Return candidates, of which those are usable that are like none that was tried, nor in the place of a sure pose.
+def best_left(
+    found: Candidates,
+    tried: Int[np.ndarray, " k"],
+    taken: Float32[np.ndarray, "t 4 4"],
+    calibration: Calibration,
+    part: DevicePart,
+    config: DetectConfig,
+) -> Int[np.ndarray, " b"]:
+    """Return the rows of the most probable candidate of each place, but for places that poses have `taken`.
 
-    Turns under which the part looks the same count as others.
+    Candidates that are like those in the rows that were `tried` are left out.
     """
-    surface = np.asarray(on_device.arrays.points)[:_POINTS]
-    places = _placed(found, surface)
-    is_sure = best.selection.kept & (best.probability >= sure)
-    centers, sure_centers = (
-        of.mean(axis=1, keepdims=True) for of in (places, _placed(best.candidates, surface)[is_sure])
-    )
-    done = _near(places, places[tried], _OTHER * float(on_device.arrays.diameter))
-    return found._replace(usable=found.usable & ~done & ~_near(centers, sure_centers, float(on_device.reach)))
+    probability, possible = _possible(found, calibration, config)
+    rows = np.flatnonzero(possible)
+    rows = rows[~_alike(found.T_camera_object[rows], found.T_camera_object[tried], part)]
+    if not len(rows):
+        return rows
+    poses = np.concatenate([taken, found.T_camera_object[rows]])
+    score = np.concatenate([np.full(len(taken), _SURE), probability[rows]])
+    return rows[_selected(poses, np.ones(len(poses), dtype=bool), score, score, part).kept[len(taken) :]]
 
 
-def _placed(found: Candidates, surface: Float32[np.ndarray, "p 3"]) -> Float32[np.ndarray, "s p 3"]:
-    """Return points of the part at each candidate."""
-    return surface @ found.T_camera_object[:, :3, :3].swapaxes(1, 2) + found.T_camera_object[:, None, :3, 3]
+def _alike(
+    poses: Float32[np.ndarray, "s 4 4"], tried: Float32[np.ndarray, "k 4 4"], part: DevicePart
+) -> Bool[np.ndarray, " s"]:
+    """Return which poses are nowhere farther than `_OTHER` from one that was tried, up to symmetry."""
+    points, symmetries = np.asarray(part.arrays.points), np.asarray(part.symmetries)
+    diameter, surface = float(part.arrays.diameter), points[:_POINTS]
+    centers, tried_centers = (_placed(some, points.mean(axis=0)[None]) for some in (poses, tried))
+    apart = np.linalg.norm(centers - tried_centers[:, 0], axis=2)
+    own, other = np.nonzero(apart <= _APART * diameter)  # most are ruled out by that
+    places = _placed(poses, surface)[own, None]
+    turned = _placed((tried[:, None] @ symmetries).reshape(-1, 4, 4), surface)
+    turned = turned.reshape(len(tried), len(symmetries), *surface.shape)[other]
+    near = ((places - turned) ** 2).sum(axis=3).max(axis=2) <= (_OTHER * diameter) ** 2
+    result = np.zeros(len(poses), dtype=bool)
+    result[own[near.any(axis=1)]] = True
+    return result
 
 
-def _near(own: Float[np.ndarray, "s p 3"], others: Float[np.ndarray, "k p 3"], reach: float) -> Bool[np.ndarray, " s"]:
-    """Return which candidates have all of their points within `reach` of those of another one."""
-    near = np.zeros(len(own), dtype=bool)
-    for other in others:
-        near |= (((own - other) ** 2).sum(axis=2) <= reach**2).all(axis=1)
-    return near
+def _placed(poses: Float32[np.ndarray, "s 4 4"], points: Float32[np.ndarray, "p 3"]) -> Float32[np.ndarray, "s p 3"]:
+    """Return points of the part at each pose."""
+    return points @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
 
 
 def _together(before: Candidates, more: Candidates) -> Candidates:
@@ -189,17 +206,34 @@ def chosen(
     exact: Calibration | None = None,
 ) -> Selection:
     """Choose among the most probable candidates, by an `exact` model where there is one."""
-    probability = np.zeros(len(found.usable))
-    probability[found.usable] = calibration.probability(found.evidence[found.usable])
-    possible = found.usable & (probability >= config.reported)
-    ranked = np.argsort(-np.where(possible, probability, -1), kind="stable")[:_CONSIDERED]
-    rows = np.pad(ranked, (0, _CONSIDERED - len(ranked)), mode="edge")
-    usable = possible[rows] & (np.arange(_CONSIDERED) < len(ranked))
-    poses = found.T_camera_object[rows]
+    probability, possible = _possible(found, calibration, config)
     score = probability.copy()
     if exact is not None:
         score[possible] = exact.probability(found.evidence[possible])
-    given = jax.device_put((poses, score[rows].astype(np.float32), usable))
+    return _selected(found.T_camera_object, possible, probability, score, part)
+
+
+def _possible(
+    found: Candidates, calibration: Calibration, config: DetectConfig
+) -> tuple[Float[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
+    """Return how probable candidates are, and which are probable enough to be reported."""
+    probability = np.zeros(len(found.usable))
+    probability[found.usable] = calibration.probability(found.evidence[found.usable])
+    return probability, found.usable & (probability >= config.reported)
+
+
+def _selected(
+    poses: Float32[np.ndarray, "s 4 4"],
+    possible: Bool[np.ndarray, " s"],
+    rank: Float[np.ndarray, " s"],
+    score: Float[np.ndarray, " s"],
+    part: DevicePart,
+) -> Selection:
+    """Choose by score among those possible poses that rank highest."""
+    ranked = np.argsort(-np.where(possible, rank, -1), kind="stable")[:_CONSIDERED]
+    rows = np.pad(ranked, (0, _CONSIDERED - len(ranked)), mode="edge")
+    usable = possible[rows] & (np.arange(_CONSIDERED) < len(ranked))
+    given = jax.device_put((poses[rows], score[rows].astype(np.float32), usable))
     few: Selection = jax.device_get(select_poses(given[0], given[1], given[2], part))
 
     def of_all(values: Any) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,9 +17,11 @@ from kmn_jax.detection import (
     Choice,
     Clock,
     DetectConfig,
+    DevicePart,
     Probabilities,
     SearchConfig,
     choose_and_refine,
+    same_place,
 )
 from kmn_jax.detection import _choice as choosing
 from kmn_jax.errors import InputError
@@ -54,6 +57,7 @@ def refine(
     become: dict[int, list[float]],
     config: DetectConfig = CONFIG,
     turned: dict[int, float] | None = None,
+    part: DevicePart | None = None,
 ) -> tuple[list[list[int]], Choice]:
     """Return which candidates are refined in each turn, and the choice.
 
@@ -77,7 +81,8 @@ def refine(
         return Candidates(poses, usable, evidence, *columns, of.found, of.seed_rows)
 
     monkeypatch.setattr(choosing, "refined_candidates", refined)
-    return turns, choose_and_refine(found, MODELS, on_device(BOX), box_view(), 0, config, SearchConfig(), Clock())
+    part = part or on_device(BOX)
+    return turns, choose_and_refine(found, MODELS, part, box_view(), 0, config, SearchConfig(), Clock())
 
 
 def stand(choice: Choice) -> dict[int, float]:
@@ -131,6 +136,27 @@ def test_what_would_become_the_same_pose_or_is_hardly_probable_is_not_refined(mo
     found = candidates((0.0, 3.0), (0.02 * BOX.diameter, 1.0), (APART, -4.0))
     turns, _ = refine(monkeypatch, found, {0: [0.0, 0.0]})
     assert turns == [[0], [0]]
+
+
+def test_what_looks_like_one_that_was_tried_is_not_refined(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = candidates((0.0, 3.0), (0.0, 1.0), (FAR, 4.0))
+    half = np.diag([-1.0, -1.0, 1.0, 1.0])
+    found.T_camera_object[1] @= half
+    become = {0: [0.0, 0.0], 1: [0.0], 2: [5.0]}
+    assert refine(monkeypatch, found, become)[0] == [[0, 2], [1], [0]]
+    part = on_device(BOX)._replace(symmetries=jnp.asarray(np.stack([np.eye(4), half]), jnp.float32))
+    assert refine(monkeypatch, found, become, part=part)[0] == [[0, 2], [0]]
+
+
+def test_where_a_sure_pose_stands_no_other_is_refined(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second is farther from the first than poses of one copy are, but lies in it for the most part."""
+    beside = 0.25 * BOX.diameter
+    assert beside > same_place(BOX)
+    found = candidates((0.0, 3.0), (beside, 1.0), (FAR, 4.0), (FAR + APART, 0.0))
+    turns, _ = refine(monkeypatch, found, {0: [4.0], 2: [0.0, 0.0], 3: [0.0]})
+    assert turns == [[0, 2], [3], [2]]
+    turns, _ = refine(monkeypatch, found, {0: [0.0, 0.0], 1: [-1.0], 2: [4.0]})
+    assert turns == [[0, 2], [1], [0]]
 
 
 def test_settings_say_how_many_are_refined(monkeypatch: pytest.MonkeyPatch) -> None:

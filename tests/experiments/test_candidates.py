@@ -95,7 +95,8 @@ def store(path: Path, network: Model, names: tuple[str, ...] = EVIDENCE, **other
         "narrowed": np.zeros(6, dtype=bool),
         "T_camera_object": poses,
         "refined": np.array([False, True, True, True, True, True]),
-        "due": np.array([False, True, True, True, False, False]),
+        "turn": np.array([-1, 0, 0, 0, -1, -1]),
+        "due": np.zeros(6, dtype=bool),
         "reported": np.zeros(6, dtype=bool),
     }
     np.savez(path, **stored | others)
@@ -217,6 +218,23 @@ def test_poses_are_chosen_among_as_those_of_a_search(motor: DevicePart) -> None:
     few = chosen(module._choosable(poses[usable], evidence[usable]), model, motor, DetectConfig(reported=0.0)).kept
     np.testing.assert_array_equal(few, whole[usable])
     assert 0 < few.sum() < len(few)
+
+
+def test_of_later_turns_detection_sees_what_is_not_near_a_sure_pose(motor: DevicePart) -> None:
+    """Where the first copy is sure, of the second one a pose of the second turn becomes so, before the third."""
+    places, odds = [0.0, 0.02, 5.0, 5.02, 5.04, 0.04], [4.0, 5.0, 0.0, 4.0, 6.0, 7.0]
+    turns, exact = np.array([0, 1, 0, 1, 2, -1]), Calibration(EVIDENCE, (1.0,) + (0.0,) * (len(EVIDENCE) - 1), 0.0)
+    poses = np.tile(np.eye(4, dtype=np.float32), (6, 1, 1))
+    poses[:, 0, 3] = places
+    evidence = np.zeros((6, len(EVIDENCE)), dtype=np.float32)
+    evidence[:, 0] = odds
+    found = module._choosable(poses, evidence)
+    kept, due = module._chosen_in_turns(found, turns, exact, exact, motor)
+    assert due.tolist() == [True, False, True, True, False, False]
+    assert kept.tolist() == [True, False, False, True, False, False]
+    kept, due = module._chosen_in_turns(found, np.minimum(turns, 0), exact, exact, motor)
+    assert due.tolist() == [True] * 5 + [False]
+    assert kept.tolist() == [False, True, False, False, True, False]
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from experiments import candidates as module
-from experiments.fits import FitOptions
+from experiments.fits import FitOptions, weights_of
 from experiments.searches import Sources
 from kmn_jax.detection import EVIDENCE, Candidates, DetectConfig
 from kmn_jax.errors import InputError
@@ -29,23 +29,32 @@ def network() -> Model:
     return create_model(TINY, jax.random.key(0))
 
 
-def test_what_detection_refines_is_told_of_all_forms(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of six candidates four are refined, of which detection, which is stricter, refines two; one form is missing."""
-    rows, forms = np.array([0, 2, 3, 5]), 3
-    usable = np.ones(len(rows) * forms, dtype=bool)
-    usable[5] = False  # the second form of the second candidate
+def test_candidates_are_refined_in_the_turns_of_detection(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of nine candidates detection refines two first, and then others turn by turn; two are just not probable."""
 
-    def stricter(found: None, model: None, part: None, config: DetectConfig) -> Any:
-        assert config == DetectConfig()
-        kept, contenders = np.zeros((2, 6), dtype=bool)
-        kept[[1, 2]], contenders[5] = True, True
+    def first(found: None, model: None, part: None, config: DetectConfig) -> Any:
+        kept, contenders = np.zeros((2, 9), dtype=bool)
+        kept[1], contenders[5] = True, True
+        if config == module._LOOSE:
+            kept[2], contenders[8] = True, True
+        else:
+            assert config == module._CONFIG
         return SimpleNamespace(kept=kept, contenders=contenders)
 
-    monkeypatch.setattr(module, "chosen", stricter)
+    asked: list[list[int]] = []
+
+    def left(found: None, tried: np.ndarray, taken: np.ndarray, model: None, part: None, config: DetectConfig) -> Any:
+        assert (taken.shape, config) == ((0, 4, 4), module._CONFIG)
+        asked.append(tried.tolist())
+        return np.array([[4, 0], [3], [], []][len(asked) - 1], dtype=int)
+
+    monkeypatch.setattr(module, "chosen", first)
+    monkeypatch.setattr(module, "best_left", left)
     nothing: Any = None
-    fine: Any = SimpleNamespace(usable=usable)
-    due = module._due(nothing, nothing, nothing, rows, fine)
-    np.testing.assert_array_equal(due, [False, True, False, True, False, False, True, False, True, False, True])
+    rows, turns = module._turns(nothing, nothing, nothing)
+    assert rows.tolist() == [1, 5, 2, 8, 4, 0, 3]
+    assert turns.tolist() == [0, 0, -1, -1, 1, 1, 2]
+    assert asked == [[1, 5], [1, 5, 4, 0], [1, 5, 4, 0, 3], [1, 5, 4, 0, 3]]
 
 
 class Asked:
@@ -58,14 +67,14 @@ class Asked:
         self.order = [0, 1, 2]
         self.proposed: list[int] = []
         self.chosen_by: list[tuple[int, int]] = []
-        models = {False: {7: 1, 9: 3}, True: {7: 1, 8: 2, 9: 3}}
         monkeypatch.setattr(module, "searches", self.searches)
         monkeypatch.setattr(module, "_first_seeds", lambda search: None)
         monkeypatch.setattr(module, "_propose", lambda search, *given: partial(self.propose, search.scene))
         monkeypatch.setattr(module, "_explored", lambda search, propose, model: self.found(2, 10.0 + model))
-        monkeypatch.setattr(module, "_models", lambda poses, fits: models[bool(poses["refined"].all())])
+        monkeypatch.setattr(module, "_models", self.models)
         monkeypatch.setattr(module, "model_of", lambda poses, fits: 5)
         monkeypatch.setattr(module, "chosen", self.all_of)
+        monkeypatch.setattr(module, "best_left", lambda *given: np.zeros(0, dtype=int))
         monkeypatch.setattr(module, "refined_candidates", lambda part, scene, found, *_: found)
 
     def searches(self, sources: Sources, network: Any) -> Any:
@@ -84,9 +93,14 @@ class Asked:
             facts["is_empty"] = own == 3
             yield SimpleNamespace(row=row, on_device=own, scene=own, **facts)
 
+    def models(self, poses: dict[str, np.ndarray], fits: FitOptions) -> dict[int, int]:
+        assert len(weights_of(poses, fits)) == len(poses["error"])  # all columns that fits want are there
+        return {7: 1, 8: 2, 9: 3} if poses["refined"].all() else {7: 1, 9: 3}
+
     def found(self, count: int, evidence: float) -> Any:
         none: Any = None
-        return Candidates(none, np.ones(count, dtype=bool), np.array([evidence]), none, none, none, none)
+        poses = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1))
+        return Candidates(poses, np.ones(count, dtype=bool), np.array([evidence]), none, none, none, none)
 
     def propose(self, own: int, rows: Any) -> Any:
         self.proposed.append(own)
@@ -229,7 +243,7 @@ def test_a_search_is_explored_as_by_detection(monkeypatch: pytest.MonkeyPatch, m
         "FPFH": ("stranger", "on device", scene, "rows"),
     }
     assert module._explored(search, propose, named["chooser"]) == wanted[method]
-    assert asked == [(scene, "stranger", "chooser", DetectConfig())]
+    assert asked == [(scene, "stranger", "chooser", module._CONFIG)]
     assert module._first_seeds(search) == (scene, "foreground", "stranger")
 
 
