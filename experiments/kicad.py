@@ -11,6 +11,7 @@ from pathlib import Path
 
 from kmn_jax.data import SPLITS, Source
 from kmn_jax.errors import InputError
+from kmn_jax.files import make_folder
 
 CATALOGUE = Path(__file__).parent / "assets" / "electronics.json"
 PACKAGE = "kicad-packages3d"
@@ -47,7 +48,7 @@ def _extract_missing(names: list[str], cache: Path) -> None:
             f"this is not a Debian system, so {PACKAGE} cannot be fetched: get KiCad's 3D models (packages3D) and name"
             " their folder with --models"
         )
-    cache.mkdir(parents=True, exist_ok=True)
+    make_folder(cache)
     with tempfile.TemporaryDirectory(dir=cache.absolute()) as scratch:
         print(f"downloading {PACKAGE} (380 MB)", flush=True)
         _run(["apt-get", "download", "-qq", PACKAGE], scratch, f"{PACKAGE} could not be downloaded")

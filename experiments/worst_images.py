@@ -10,6 +10,7 @@ import numpy as np
 from experiments.bins import WorldImage
 from experiments.detect_bins import Tally
 from kmn_jax.detection import Detections, Scene
+from kmn_jax.files import make_folder
 from kmn_jax.viz import save_picture
 
 _KEPT = 3  # images of a family
@@ -44,7 +45,7 @@ class WorstImages:
 
     def save(self, folder: Path) -> list[Path]:
         """Draw them, with the true poses, and return the files: named by family, image, missed copies, wrong poses."""
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         paths = []
         for family, images in self._kept.items():
             for one in images:

@@ -22,7 +22,7 @@ from safetensors.numpy import save
 from experiments.evaluation.cases import Case, Method, ObjectImages, draw_cases
 from experiments.evaluation.refinement import Refinement
 from kmn_jax.errors import InputError
-from kmn_jax.files import read_safetensors, write_whole
+from kmn_jax.files import make_folder, read_safetensors, write_whole
 from kmn_jax.report import commit
 
 _HEADER = "kmn_jax evaluation 1"
@@ -148,7 +148,7 @@ class Export:
         self, method: str, name: str, noise: float, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]
     ) -> None:
         path = self.path(method, name, noise)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         plain = {key: np.ascontiguousarray(value) for key, value in tensors.items()}
         own = {"format": _HEADER, "recipe": self._digest(method), "commit": self.commit}
         write_whole(path, save(plain, metadata={**own, **metadata}))

@@ -26,9 +26,10 @@ from kmn_jax.detection import (
 from kmn_jax.detection import _choice as choosing
 from kmn_jax.errors import InputError
 from tests.detection.box_sample import box_view
-from tests.detection.test_selection import BOX, on_device
 from tests.reference.meshes import pose
+from tests.reference.parts import box_part, on_device
 
+BOX = box_part()
 CONFIG = DetectConfig(next_best=4, sure=0.9)
 
 

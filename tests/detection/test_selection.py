@@ -14,7 +14,6 @@ from kmn_jax.detection import (
     Calibration,
     Candidates,
     DetectConfig,
-    DevicePart,
     Selection,
     same_place,
     select,
@@ -22,12 +21,11 @@ from kmn_jax.detection import (
 )
 from kmn_jax.detection import chosen as choose_candidates
 from kmn_jax.detection._selection import _greedy, overlap, share_inside
-from kmn_jax.objects import Part, PartArrays, Symmetries
+from kmn_jax.objects import Part, Symmetries
 from kmn_jax.objects._symmetry import rotation_about
 from kmn_jax.pose import mssd
-from kmn_jax.simulate import Surfels
 from tests.reference.meshes import pose, random_rotations
-from tests.reference.parts import box_part
+from tests.reference.parts import box_part, on_device
 
 Z = np.array([0.0, 0.0, 1.0])
 BOX = box_part()
@@ -41,14 +39,6 @@ def moved(x: float, y: float, z: float, rotation: np.ndarray | None = None) -> n
 def apart(one: np.ndarray, others: list[np.ndarray], transforms: np.ndarray = NO_TURN) -> np.ndarray:
     single = [mssd(one.astype("f4"), other.astype("f4"), BOX.points, transforms) for other in others]
     return np.array(single)
-
-
-def on_device(part: Part) -> DevicePart:
-    points, normals = jnp.asarray(part.points), jnp.asarray(part.normals)
-    arrays = PartArrays(points, normals, jnp.zeros((8, 4)), jnp.float32(part.diameter))
-    surfels = Surfels(points, normals, jnp.float32(part.area))
-    symmetries, reach = jnp.asarray(symmetry_transforms(part.symmetries)), jnp.float32(same_place(part))
-    return DevicePart(arrays, surfels, symmetries, reach, jnp.eye(4)[None], jnp.zeros(1, bool))
 
 
 def chosen(

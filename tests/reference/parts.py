@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 
-from kmn_jax.objects import Part, Symmetries
+from kmn_jax.detection import DevicePart, same_place, symmetry_transforms
+from kmn_jax.objects import Part, PartArrays, Symmetries
+from kmn_jax.simulate import Surfels
 
 HALF = np.array([1.0, 0.5, 0.5])
 
@@ -39,3 +42,12 @@ def box_part(
         source_digest="",
         model_digest="",
     )
+
+
+def on_device(part: Part) -> DevicePart:
+    """Put a part onto the device, without a network and without what it looks like."""
+    points, normals = jnp.asarray(part.points), jnp.asarray(part.normals)
+    arrays = PartArrays(points, normals, jnp.zeros((8, 4)), jnp.float32(part.diameter))
+    surfels = Surfels(points, normals, jnp.float32(part.area))
+    symmetries, reach = jnp.asarray(symmetry_transforms(part.symmetries)), jnp.float32(same_place(part))
+    return DevicePart(arrays, surfels, symmetries, reach, jnp.eye(4)[None], jnp.zeros(1, bool))
