@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -25,6 +25,7 @@ from kmn_jax.detection import (
 )
 from kmn_jax.errors import InputError, require
 
+_AT_ONCE = 2  # fits, each of which takes one core
 _SCALE_RIDGE = 1e-4  # hardly any: it makes probabilities too modest
 
 
@@ -56,11 +57,16 @@ def told(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def held_out_models(
     poses: dict[str, np.ndarray], options: FitOptions
-) -> Iterator[tuple[Int[np.ndarray, " o"], Calibration]]:
-    """Yield some objects, and the model that is fitted to the poses of all others, until each had its turn."""
-    for own in _folds(poses, options):
+) -> list[tuple[Int[np.ndarray, " o"], Calibration]]:
+    """Return each object once, with others, and the model that is fitted to the poses of all but these."""
+
+    def of_others(own: Int[np.ndarray, " o"]) -> Calibration:
         others = ~np.isin(poses["object"], own)
-        yield own, model_of({column: values[others] for column, values in poses.items()}, options)
+        return model_of({column: values[others] for column, values in poses.items()}, options)
+
+    folds = _folds(poses, options)
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        return list(zip(folds, pool.map(of_others, folds), strict=True))
 
 
 def _folds(poses: dict[str, np.ndarray], options: FitOptions) -> list[Int[np.ndarray, " o"]]:
