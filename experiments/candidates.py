@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from pathlib import Path
 from threading import Lock
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 from zipfile import BadZipFile
 
 import numpy as np
@@ -19,6 +17,7 @@ from jaxtyping import Bool, Float32, Int
 from experiments.fits import FitOptions, by_largest_error, held_out_models, model_of, told
 from experiments.fpfh import fpfh_poses
 from experiments.searches import SEARCHED, Columns, Search, Sources, searches
+from experiments.two_at_once import AT_ONCE, side_by_side
 from kmn_jax.detection import (
     EVIDENCE,
     PICTURE_EVIDENCE,
@@ -30,9 +29,10 @@ from kmn_jax.detection import (
     DetectConfig,
     DevicePart,
     SearchConfig,
-    best_left,
     chosen,
     explore,
+    in_places_of,
+    next_best_rows,
     picture_evidence,
     refined_candidates,
     search_at,
@@ -62,9 +62,6 @@ _COLUMNS = (  # of what is stored
 )
 _HOW = 9  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
 _IN_MEMORY = 600  # searches, of each of which what was found first, crops and all, takes 10 MB
-_AT_ONCE = 2  # searches: one alone leaves a part of two cores idle
-_Item = TypeVar("_Item")
-_Made = TypeVar("_Made")
 _READING = Lock()  # NumPy parses the headers of arrays, which CPython 3.11 sometimes refuses two threads at once
 
 
@@ -147,7 +144,7 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
     config = _CONFIG.search_of(network.config)
     first: dict[int, Candidates] = {}
     kept = _Kept(folder, repr((_HOW, SEARCHED, sources.method, *_settings(fits, network), EVIDENCE)))
-    at_once = 1 if sources.method == "FPFH" else _AT_ONCE  # whose random numbers are those of the whole process
+    at_once = 1 if sources.method == "FPFH" else AT_ONCE  # whose random numbers are those of the whole process
 
     def propose(search: Search) -> Callable[[Int[np.ndarray, " c"]], Candidates]:
         return _propose(search, network, config, sources.method)
@@ -217,22 +214,6 @@ class _Kept:
         return columns | {name: np.full(len(columns["error"]), value) for name, value in of_search.items()}
 
 
-def side_by_side(function: Callable[[_Item], _Made], items: Iterable[_Item], at_once: int = _AT_ONCE) -> list[_Made]:
-    """Return what a function makes of items, some of which it is given at once."""
-    results: list[_Made] = []
-    running: deque[Future[_Made]] = deque()
-    with ThreadPoolExecutor(at_once) as pool:
-        try:
-            for item in items:
-                running.append(pool.submit(function, item))
-                if len(running) > at_once:  # no more are read in advance
-                    results.append(running.popleft().result())
-            return [*results, *(one.result() for one in running)]
-        except BaseException:
-            pool.shutdown(cancel_futures=True)  # what runs ends, and is kept
-            raise
-
-
 def _turns(
     found: Candidates, chooser: Calibration, on_device: DevicePart
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
@@ -241,17 +222,15 @@ def _turns(
     Those that are just not probable enough for detection, of which there is one turn, are -1.
     """
     loose, first = (chosen(found, chooser, on_device, config) for config in (_LOOSE, _CONFIG))
-    due = first.kept | first.contenders
-    rows = [np.flatnonzero(due), np.flatnonzero((loose.kept | loose.contenders) & ~due)]
-    turns = [np.full(len(rows[0]), 0), np.full(len(rows[1]), -1)]
-    none = np.zeros((0, 4, 4), dtype=np.float32)
-    tried = rows[0]
-    for turn in range(1, 1 + _CONFIG.next_best):
-        more = best_left(found, tried, none, chooser, on_device, _CONFIG)
-        tried = np.concatenate([tried, more])
-        rows.append(more)
-        turns.append(np.full(len(more), turn))
-    return np.concatenate(rows), np.concatenate(turns)
+    rows = [np.flatnonzero(first.kept | first.contenders)]
+    nothing_sure = np.zeros((0, 4, 4), dtype=np.float32)
+    while len(rows[-1]) > 0 and len(rows) <= _CONFIG.next_best:
+        rows.append(next_best_rows(found, np.concatenate(rows), nothing_sure, chooser, on_device, _CONFIG))
+    others = loose.kept | loose.contenders
+    others[np.concatenate(rows)] = False
+    rows.append(np.flatnonzero(others))
+    turns = [*range(len(rows) - 1), -1]
+    return np.concatenate(rows), np.repeat(turns, [len(some) for some in rows])
 
 
 def judged_anew(poses: Columns, names: tuple[str, ...], sources: Sources, fits: FitOptions, network: Model) -> Columns:
@@ -330,9 +309,10 @@ def _with_reported(poses: Columns, searched: dict[int, DevicePart], fits: FitOpt
 def _chosen_in_turns(
     found: Candidates, turns: Int[np.ndarray, " s"], model: Calibration, exact: Calibration, on_device: DevicePart
 ) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
-    """Return which refined poses detection reports, and among which it chooses.
+    """Return which refined poses detection reports, and among which it chooses: later ones not in a sure pose's place.
 
-    It does not come to later ones near a sure pose; near is what has its middle no farther than poses of one copy have.
+    Which are sure is told before the model is scaled, and poses do not vouch for each other; nor is known what would
+    become of doubtful ones that are refined once more.
     """
 
     def kept_of(rows: Bool[np.ndarray, " s"]) -> Bool[np.ndarray, " s"]:
@@ -340,14 +320,12 @@ def _chosen_in_turns(
 
     due = turns == 0
     kept = kept_of(due)
-    if (turns <= 0).all():
-        return kept, due
-    is_sure = model.probability(found.evidence) >= _CONFIG.sure
-    middles = found.T_camera_object @ np.append(np.asarray(on_device.arrays.points).mean(axis=0), 1)
     for turn in range(1, 1 + turns.max()):
-        away = np.linalg.norm(middles[:, None] - middles[kept & is_sure], axis=2)
-        due |= (turns == turn) & (away > float(on_device.reach)).all(axis=1)
-        kept = kept_of(due)
+        sure = kept & (model.probability(found.evidence) >= _CONFIG.sure)
+        more = (turns == turn) & ~in_places_of(found.T_camera_object, found.T_camera_object[sure], on_device)
+        if more.any():
+            due |= more
+            kept = kept_of(due)
     return kept, due
 
 

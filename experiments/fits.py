@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from experiments.bins import THRESHOLD
 from experiments.reliability_picture import reliability_table
+from experiments.two_at_once import side_by_side
 from kmn_jax.detection import (
     COMPANY,
     EVIDENCE,
@@ -25,7 +25,6 @@ from kmn_jax.detection import (
 )
 from kmn_jax.errors import InputError, require
 
-_AT_ONCE = 2  # fits, each of which takes one core
 _SCALE_RIDGE = 1e-4  # hardly any: it makes probabilities too modest
 
 
@@ -65,8 +64,7 @@ def held_out_models(
         return model_of({column: values[others] for column, values in poses.items()}, options)
 
     folds = _folds(poses, options)
-    with ThreadPoolExecutor(_AT_ONCE) as pool:
-        return list(zip(folds, pool.map(of_others, folds), strict=True))
+    return list(zip(folds, side_by_side(of_others, folds), strict=True))
 
 
 def _folds(poses: dict[str, np.ndarray], options: FitOptions) -> list[Int[np.ndarray, " o"]]:

@@ -28,10 +28,11 @@ from jaxtyping import Array, Bool, Float, Float16, Int
 from tqdm import tqdm
 
 from experiments.bins import THRESHOLD
-from experiments.candidates import read_columns, read_poses, searches_of, side_by_side, write_columns
+from experiments.candidates import read_columns, read_poses, searches_of, write_columns
 from experiments.detect_bins import PRECISION, Tally
 from experiments.fits import FitOptions, told, weights_of
 from experiments.searches import Columns, Search, Sources
+from experiments.two_at_once import side_by_side
 from kmn_jax.detection import PREDICTED_CHANNELS, VERIFIER_SIDE, call_rows, polish, verifier_cells
 from kmn_jax.errors import InputError, require
 from kmn_jax.files import make_folder, write_whole

@@ -18,7 +18,15 @@ from kmn_jax.detection._calibration import (
     vouched,
 )
 from kmn_jax.detection._canonical import canonical_pose
-from kmn_jax.detection._choice import Choice, best_left, choose_and_refine, chosen, refined_candidates, reported
+from kmn_jax.detection._choice import (
+    Choice,
+    choose_and_refine,
+    chosen,
+    in_places_of,
+    next_best_rows,
+    refined_candidates,
+    reported,
+)
 from kmn_jax.detection._config import FAST, THOROUGH, DetectConfig, Effort, config_of
 from kmn_jax.detection._coverage import near_surface
 from kmn_jax.detection._crop_search import (
@@ -136,7 +144,6 @@ __all__ = [
     "Timing",
     "as_json",
     "away_from_empty",
-    "best_left",
     "bin_content",
     "bin_poses",
     "calibration_beside",
@@ -166,6 +173,7 @@ __all__ = [
     "gather_evidence",
     "grasp_conflict",
     "in_front_of_empty",
+    "in_places_of",
     "inside_bin",
     "into",
     "join",
@@ -179,6 +187,7 @@ __all__ = [
     "matches_of",
     "near_surface",
     "network_prediction",
+    "next_best_rows",
     "picture_agreement",
     "picture_evidence",
     "placed",

@@ -30,7 +30,7 @@ _CONSIDERED = 128  # most probable poses that are compared with each other: one 
 _POINTS = 16  # on the surface, by which candidates are told apart
 _OTHER = 0.05  # diameters: a candidate that is nowhere farther from one that was refined would become the same pose
 _APART = 2 * _OTHER  # centres of mass of such candidates, as sampled, are no farther apart
-_SURE = 2.0  # a score above all probabilities
+_NUMBERS = 1 << 22  # that are compared at once: balls have thousands of symmetries
 
 
 class Choice(NamedTuple):
@@ -54,7 +54,7 @@ def choose_and_refine(
     """Return refined candidates, and the choice among them; what was found as it is where nothing of it is chosen.
 
     Refined are the most probable one of each place and a contender; then, up to `config.next_best` times, the next one
-    of each place where no sure pose stands; and in the end those that stand and are not sure, once more from where they
+    of each place that no sure pose is in; and in the end those that stand and are not sure, once more from where they
     are. `search` is `config.search` of the network.
     """
     with clock("selection"):
@@ -75,7 +75,7 @@ def choose_and_refine(
     for _ in range(config.next_best):
         with clock("selection"):
             sure = best.candidates.T_camera_object[best.selection.kept & (best.probability >= config.sure)]
-            rows = best_left(found, np.concatenate(tried), sure, probabilities.found, on_device, config)
+            rows = next_best_rows(found, np.concatenate(tried), sure, probabilities.found, on_device, config)
         if not len(rows):
             break
         best = judged(_together(best.candidates, refined(rows)))
@@ -88,43 +88,54 @@ def choose_and_refine(
     return judged(_together(best.candidates, refined(rows, best.candidates.T_camera_object[doubtful])))
 
 
-def best_left(
+def next_best_rows(
     found: Candidates,
     tried: Int[np.ndarray, " k"],
-    taken: Float32[np.ndarray, "t 4 4"],
+    sure: Float32[np.ndarray, "t 4 4"],
     calibration: Calibration,
     part: DevicePart,
     config: DetectConfig,
 ) -> Int[np.ndarray, " b"]:
-    """Return the rows of the most probable candidate of each place, but for places that poses have `taken`.
+    """Return the rows of the most probable candidate of each place that no `sure` pose is in.
 
     Candidates that are like those in the rows that were `tried` are left out.
     """
-    probability, possible = _possible(found, calibration, config)
-    rows = np.flatnonzero(possible)
+    rows = np.flatnonzero(found.usable)
+    rows = rows[~in_places_of(found.T_camera_object[rows], sure, part)]
     rows = rows[~_alike(found.T_camera_object[rows], found.T_camera_object[tried], part)]
-    if not len(rows):
-        return rows
-    poses = np.concatenate([taken, found.T_camera_object[rows]])
-    score = np.concatenate([np.full(len(taken), _SURE), probability[rows]])
-    return rows[_selected(poses, np.ones(len(poses), dtype=bool), score, score, part).kept[len(taken) :]]
+    usable = np.zeros_like(found.usable)
+    usable[rows] = True
+    return np.flatnonzero(chosen(found._replace(usable=usable), calibration, part, config).kept)
+
+
+def in_places_of(
+    poses: Float32[np.ndarray, "s 4 4"], others: Float32[np.ndarray, "t 4 4"], part: DevicePart
+) -> Bool[np.ndarray, " s"]:
+    """Return which poses have their middle as near to that of another one as poses of one copy may."""
+    middle = np.asarray(part.arrays.points).mean(axis=0)[None]
+    apart = np.linalg.norm(_placed(poses, middle) - _placed(others, middle)[:, 0], axis=2)
+    return (apart <= float(part.reach)).any(axis=1)
 
 
 def _alike(
     poses: Float32[np.ndarray, "s 4 4"], tried: Float32[np.ndarray, "k 4 4"], part: DevicePart
 ) -> Bool[np.ndarray, " s"]:
-    """Return which poses are nowhere farther than `_OTHER` from one that was tried, up to symmetry."""
-    points, symmetries = np.asarray(part.arrays.points), np.asarray(part.symmetries)
+    """Return which poses are nowhere farther than `_OTHER` from one that was tried, up to symmetry.
+
+    Of continuous symmetries there are steps: what is turned by half of one may count as another pose.
+    """
+    points, symmetries = np.asarray(part.arrays.points), np.unique(np.asarray(part.symmetries), axis=0)
     diameter, surface = float(part.arrays.diameter), points[:_POINTS]
-    centers, tried_centers = (_placed(some, points.mean(axis=0)[None]) for some in (poses, tried))
-    apart = np.linalg.norm(centers - tried_centers[:, 0], axis=2)
-    own, other = np.nonzero(apart <= _APART * diameter)  # most are ruled out by that
-    places = _placed(poses, surface)[own, None]
-    turned = _placed((tried[:, None] @ symmetries).reshape(-1, 4, 4), surface)
-    turned = turned.reshape(len(tried), len(symmetries), *surface.shape)[other]
-    near = ((places - turned) ** 2).sum(axis=3).max(axis=2) <= (_OTHER * diameter) ** 2
-    result = np.zeros(len(poses), dtype=bool)
-    result[own[near.any(axis=1)]] = True
+    middle = points.mean(axis=0)[None]
+    centers, tried_centers = _placed(poses, middle)[:, 0], _placed(tried, middle)[:, 0]
+    places, result = _placed(poses, surface), np.zeros(len(poses), dtype=bool)
+    at_once = max(1, _NUMBERS // (symmetries.shape[0] * surface.size))
+    for pose, center in zip(tried, tried_centers, strict=True):
+        turned = _placed(pose @ symmetries, surface)
+        near = ~result & (np.linalg.norm(centers - center, axis=1) <= _APART * diameter)
+        for rows in np.array_split(np.flatnonzero(near), -(-near.sum() // at_once) or 1):
+            farthest = ((places[rows, None] - turned) ** 2).sum(axis=3).max(axis=2)
+            result[rows] = (farthest <= (_OTHER * diameter) ** 2).any(axis=1)
     return result
 
 
@@ -206,34 +217,17 @@ def chosen(
     exact: Calibration | None = None,
 ) -> Selection:
     """Choose among the most probable candidates, by an `exact` model where there is one."""
-    probability, possible = _possible(found, calibration, config)
+    probability = np.zeros(len(found.usable))
+    probability[found.usable] = calibration.probability(found.evidence[found.usable])
+    possible = found.usable & (probability >= config.reported)
+    ranked = np.argsort(-np.where(possible, probability, -1), kind="stable")[:_CONSIDERED]
+    rows = np.pad(ranked, (0, _CONSIDERED - len(ranked)), mode="edge")
+    usable = possible[rows] & (np.arange(_CONSIDERED) < len(ranked))
+    poses = found.T_camera_object[rows]
     score = probability.copy()
     if exact is not None:
         score[possible] = exact.probability(found.evidence[possible])
-    return _selected(found.T_camera_object, possible, probability, score, part)
-
-
-def _possible(
-    found: Candidates, calibration: Calibration, config: DetectConfig
-) -> tuple[Float[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
-    """Return how probable candidates are, and which are probable enough to be reported."""
-    probability = np.zeros(len(found.usable))
-    probability[found.usable] = calibration.probability(found.evidence[found.usable])
-    return probability, found.usable & (probability >= config.reported)
-
-
-def _selected(
-    poses: Float32[np.ndarray, "s 4 4"],
-    possible: Bool[np.ndarray, " s"],
-    rank: Float[np.ndarray, " s"],
-    score: Float[np.ndarray, " s"],
-    part: DevicePart,
-) -> Selection:
-    """Choose by score among those possible poses that rank highest."""
-    ranked = np.argsort(-np.where(possible, rank, -1), kind="stable")[:_CONSIDERED]
-    rows = np.pad(ranked, (0, _CONSIDERED - len(ranked)), mode="edge")
-    usable = possible[rows] & (np.arange(_CONSIDERED) < len(ranked))
-    given = jax.device_put((poses[rows], score[rows].astype(np.float32), usable))
+    given = jax.device_put((poses, score[rows].astype(np.float32), usable))
     few: Selection = jax.device_get(select_poses(given[0], given[1], given[2], part))
 
     def of_all(values: Any) -> Any:

@@ -25,11 +25,14 @@ from kmn_jax.detection import (
 )
 from kmn_jax.detection import _choice as choosing
 from kmn_jax.errors import InputError
+from kmn_jax.objects._symmetry import rotation_about
+from kmn_jax.pose import mssd
 from tests.detection.box_sample import box_view
 from tests.reference.meshes import pose
 from tests.reference.parts import box_part, on_device
 
 BOX = box_part()
+Z = np.array([0.0, 0.0, 1.0])
 CONFIG = DetectConfig(next_best=4, sure=0.9)
 
 
@@ -149,15 +152,42 @@ def test_what_looks_like_one_that_was_tried_is_not_refined(monkeypatch: pytest.M
     assert refine(monkeypatch, found, become, part=part)[0] == [[0, 2], [0]]
 
 
-def test_where_a_sure_pose_stands_no_other_is_refined(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second is farther from the first than poses of one copy are, but lies in it for the most part."""
-    beside = 0.25 * BOX.diameter
-    assert beside > same_place(BOX)
-    found = candidates((0.0, 3.0), (beside, 1.0), (FAR, 4.0), (FAR + APART, 0.0))
-    turns, _ = refine(monkeypatch, found, {0: [4.0], 2: [0.0, 0.0], 3: [0.0]})
-    assert turns == [[0, 2], [3], [2]]
-    turns, _ = refine(monkeypatch, found, {0: [0.0, 0.0], 1: [-1.0], 2: [4.0]})
-    assert turns == [[0, 2], [1], [0]]
+def test_what_is_in_the_places_of_sure_poses_takes_no_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """More candidates lie there than are ever compared, and all are more probable than the next best of one place."""
+    copies, others = 20, np.arange(1, 7) * 0.03 * BOX.diameter
+    assert others.max() < same_place(BOX)
+    rows = [
+        (FAR * copy + other, odds)
+        for copy in range(copies)
+        for other, odds in [(0.0, 4.0), *((x, 3.0) for x in others)]
+    ]
+    place = -FAR
+    found = candidates(*rows, (place, 3.5), (place - APART, 1.5))
+    sure = range(0, 7 * copies, 7)
+    turns, choice = refine(monkeypatch, found, {**{row: [5.0] for row in sure}, 140: [0.0], 141: [4.5]})
+    assert turns[1:] == [[141]]
+    assert stand(choice)[141] == 4.5
+
+
+def test_many_symmetries_are_compared_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    turns = [rotation_about(Z, angle) for angle in np.linspace(0, 2 * np.pi, 36, endpoint=False)]
+    part = on_device(box_part(rotations=np.array(turns)))
+    rng = np.random.default_rng(0)
+    poses = np.stack([pose(rng.normal(size=3) * 0.02, turns[row] @ tilt) for row, tilt in enumerate(tilts(36))])
+    tried = np.stack([pose((0.0, 0.0, 0.0), turns[5]), pose((0.05, 0.0, 0.0), np.eye(3))])
+    poses, tried = poses.astype(np.float32), tried.astype(np.float32)
+    points, limit = np.asarray(part.arrays.points)[:16], 0.05 * BOX.diameter
+    nearest = [min(mssd(one, other, points, part.symmetries) for other in tried) for one in poses]
+    wanted = np.array(nearest) <= limit
+    assert 5 < wanted.sum() < 31
+    np.testing.assert_array_equal(choosing._alike(poses, tried, part), wanted)
+    monkeypatch.setattr(choosing, "_NUMBERS", 1)
+    np.testing.assert_array_equal(choosing._alike(poses, tried, part), wanted)
+
+
+def tilts(count: int) -> list[np.ndarray]:
+    """Return small rotations about x, up to 0.3."""
+    return [rotation_about(np.array([1.0, 0, 0]), angle) for angle in np.linspace(0, 0.3, count)]
 
 
 def test_settings_say_how_many_are_refined(monkeypatch: pytest.MonkeyPatch) -> None:

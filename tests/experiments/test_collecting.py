@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from threading import Barrier, Event
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,10 +14,11 @@ import pytest
 from experiments import candidates as module
 from experiments.fits import FitOptions, weights_of
 from experiments.searches import Sources
-from kmn_jax.detection import EVIDENCE, Candidates, DetectConfig
+from kmn_jax.detection import EVIDENCE, Calibration, Candidates, DetectConfig
 from kmn_jax.errors import InputError
 from kmn_jax.models import Model, create_model
 from tests.reference.networks import TINY
+from tests.reference.parts import box_part, on_device
 
 SOURCES = Sources(known_worlds=(Path("known"),))
 
@@ -29,32 +28,21 @@ def network() -> Model:
     return create_model(TINY, jax.random.key(0))
 
 
-def test_candidates_are_refined_in_the_turns_of_detection(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of nine candidates detection refines two first, and then others turn by turn; two are just not probable."""
-
-    def first(found: None, model: None, part: None, config: DetectConfig) -> Any:
-        kept, contenders = np.zeros((2, 9), dtype=bool)
-        kept[1], contenders[5] = True, True
-        if config == module._LOOSE:
-            kept[2], contenders[8] = True, True
-        else:
-            assert config == module._CONFIG
-        return SimpleNamespace(kept=kept, contenders=contenders)
-
-    asked: list[list[int]] = []
-
-    def left(found: None, tried: np.ndarray, taken: np.ndarray, model: None, part: None, config: DetectConfig) -> Any:
-        assert (taken.shape, config) == ((0, 4, 4), module._CONFIG)
-        asked.append(tried.tolist())
-        return np.array([[4, 0], [3], [], []][len(asked) - 1], dtype=int)
-
-    monkeypatch.setattr(module, "chosen", first)
-    monkeypatch.setattr(module, "best_left", left)
-    nothing: Any = None
-    rows, turns = module._turns(nothing, nothing, nothing)
-    assert rows.tolist() == [1, 5, 2, 8, 4, 0, 3]
-    assert turns.tolist() == [0, 0, -1, -1, 1, 1, 2]
-    assert asked == [[1, 5], [1, 5, 4, 0], [1, 5, 4, 0, 3], [1, 5, 4, 0, 3]]
+def test_candidates_are_refined_in_the_turns_of_detection() -> None:
+    """The last three, in a row, lie in each other's places: the third of them is just not probable enough."""
+    part = on_device(box_part())
+    places, odds = [9.0, 9.06, 0.0, 0.4, 0.8], [3.0, 1.0, 3.0, 0.0, -3.0]
+    poses = np.tile(np.eye(4, dtype=np.float32), (5, 1, 1))
+    poses[:, 0, 3] = np.array(places) * float(part.arrays.diameter)
+    evidence = np.zeros((5, len(EVIDENCE)), dtype=np.float32)
+    evidence[:, 0] = odds
+    none: Any = None
+    found = Candidates(poses, np.ones(5, dtype=bool), evidence, none, none, none, none)
+    model = Calibration(EVIDENCE, (1.0,) + (0.0,) * (len(EVIDENCE) - 1), 0.0)
+    rows, turns = module._turns(found, model, part)
+    assert (rows.tolist(), turns.tolist()) == ([0, 2, 1, 3, 4], [0, 0, 1, 1, -1])
+    rows, turns = module._turns(found._replace(usable=np.arange(5) == 4), model, part)
+    assert (rows.tolist(), turns.tolist()) == ([4], [-1])
 
 
 class Asked:
@@ -74,7 +62,7 @@ class Asked:
         monkeypatch.setattr(module, "_models", self.models)
         monkeypatch.setattr(module, "model_of", lambda poses, fits: 5)
         monkeypatch.setattr(module, "chosen", self.all_of)
-        monkeypatch.setattr(module, "best_left", lambda *given: np.zeros(0, dtype=int))
+        monkeypatch.setattr(module, "next_best_rows", lambda *given: np.zeros(0, dtype=int))
         monkeypatch.setattr(module, "refined_candidates", lambda part, scene, found, *_: found)
 
     def searches(self, sources: Sources, network: Any) -> Any:
@@ -134,6 +122,31 @@ def test_unknown_parts_are_searched_as_detection_does_and_known_ones_at_first_se
         np.testing.assert_array_equal(again[name], values)
 
 
+def test_other_forms_of_poses_have_their_turns(monkeypatch: pytest.MonkeyPatch, network: Model) -> None:
+    """Of two candidates, the second of which is refined first, the first has no second form."""
+    asked = Asked(monkeypatch)
+    asked.order = [0]
+    monkeypatch.setattr(module, "_turns", lambda *given: (np.array([1, 0]), np.array([0, 1])))
+
+    def forms(part: int, scene: int, found: Any, rows: np.ndarray, seed: int, config: Any) -> Any:
+        assert rows.tolist() == [1, 0]
+        return asked.found(4, 0.0)._replace(usable=np.array([True, True, True, False]))
+
+    seen: list[list[int]] = []
+
+    def in_turns(found: Any, turns: np.ndarray, *models: int) -> tuple[np.ndarray, np.ndarray]:
+        seen.append(turns.tolist())
+        return np.array([False, True, False]), np.array([True, True, False])
+
+    monkeypatch.setattr(module, "refined_candidates", forms)
+    monkeypatch.setattr(module, "_chosen_in_turns", in_turns)
+    result = module.collect(Sources(), FitOptions(), network)
+    assert seen == [[0, 1, 0]]
+    assert result["turn"].tolist() == [-1, 0, 1, 0]
+    assert result["reported"].tolist() == [False, False, True, False]
+    assert result["due"].tolist() == [False, True, True, False]
+
+
 def test_what_was_searched_before_an_end_is_not_searched_again(
     monkeypatch: pytest.MonkeyPatch, network: Model, tmp_path: Path
 ) -> None:
@@ -158,44 +171,6 @@ def test_what_was_searched_before_an_end_is_not_searched_again(
         module.collect(SOURCES, FitOptions(), network, folder)
     with pytest.raises(InputError, match="holds searches by other weights or settings, or other evidence: remove it"):
         module.collect(Sources(method="FPFH"), FitOptions(), network, folder)
-
-
-def test_searches_run_two_at_once_and_keep_their_order() -> None:
-    both, drawn, release = Barrier(2, timeout=20), [], Event()
-    items: list[Any] = list(range(6))
-
-    def given() -> Iterator[Any]:
-        for item in items:
-            drawn.append(item)
-            yield item
-
-    def of_item(item: int) -> Any:
-        if item < 2:
-            both.wait()
-        if item == 0:
-            release.wait(20)  # ends after the second
-            assert max(drawn) <= 3
-        elif item == 1:
-            release.set()
-        return {"error": np.array([item])}
-
-    found = module.side_by_side(of_item, given())  # type: ignore[arg-type]
-    assert [int(part["error"][0]) for part in found] == items
-
-
-def test_an_error_ends_what_was_to_be_searched_next() -> None:
-    begun: list[int] = []
-
-    def of_item(item: int) -> Any:
-        begun.append(item)
-        if item == 1:
-            raise InputError("no such image")
-        return {}
-
-    items: Any = range(100)
-    with pytest.raises(InputError, match="no such image"):
-        module.side_by_side(of_item, items)  # type: ignore[arg-type]
-    assert len(begun) < 8
 
 
 def test_bins_of_which_nothing_can_be_searched_are_refused(monkeypatch: pytest.MonkeyPatch, network: Model) -> None:
