@@ -86,7 +86,7 @@ def poses_to_fit(sources: Sources, fits: FitOptions, network: Model, stored: Pat
                 " search again"
             )
         if used == EVIDENCE and not sources.judge_anew:
-            return told(poses | {"evidence": poses["evidence"][:, [names.index(name) for name in EVIDENCE]]})
+            return _to_fit(poses | {"evidence": poses["evidence"][:, [names.index(name) for name in EVIDENCE]]})
         unused = [column for column, name in enumerate(names) if name not in EVIDENCE]
         kept = poses["evidence"][:, unused]
         poses = judged_anew(poses, names, sources, fits, network)
@@ -96,7 +96,13 @@ def poses_to_fit(sources: Sources, fits: FitOptions, network: Model, stored: Pat
         made_of = _made_of(sources, fits, network)
         of = {"made_of": made_of, "names": names, "used": EVIDENCE}  # used: for what is reported
         write_columns(stored, poses | {key: np.array(value) for key, value in of.items()})
-    return told(poses | {"evidence": poses["evidence"][:, : len(EVIDENCE)]})
+    return _to_fit(poses | {"evidence": poses["evidence"][:, : len(EVIDENCE)]})
+
+
+def _to_fit(poses: Columns) -> Columns:
+    """Return poses that are `told`, without those that detection would not have come to: their like is not judged."""
+    not_seen = (poses["turn"] > 0) & ~poses["due"]
+    return told({name: values[~not_seen] for name, values in poses.items()})
 
 
 def read_poses(
@@ -309,7 +315,9 @@ def _with_reported(poses: Columns, searched: dict[int, DevicePart], fits: FitOpt
 def _chosen_in_turns(
     found: Candidates, turns: Int[np.ndarray, " s"], model: Calibration, exact: Calibration, on_device: DevicePart
 ) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
-    """Return which refined poses detection reports, and among which it chooses: later ones not in a sure pose's place.
+    """Return which refined poses detection reports, and among which it chooses.
+
+    Later ones are seen where some pose is sure, but not in its place.
 
     Which are sure is told before the model is scaled, and poses do not vouch for each other; nor is known what would
     become of doubtful ones that are refined once more.
@@ -322,6 +330,8 @@ def _chosen_in_turns(
     kept = kept_of(due)
     for turn in range(1, 1 + turns.max()):
         sure = kept & (model.probability(found.evidence) >= _CONFIG.sure)
+        if not sure.any():
+            break
         more = (turns == turn) & ~in_places_of(found.T_camera_object, found.T_camera_object[sure], on_device)
         if more.any():
             due |= more

@@ -54,8 +54,9 @@ def choose_and_refine(
     """Return refined candidates, and the choice among them; what was found as it is where nothing of it is chosen.
 
     Refined are the most probable one of each place and a contender; then, up to `config.next_best` times, the next one
-    of each place that no sure pose is in; and in the end those that stand and are not sure, once more from where they
-    are. `search` is `config.search` of the network.
+    of each place that no sure pose is in, once one of the scene is sure: a part that is not there would only have more
+    chances to be mistaken. In the end those that stand and are not sure are refined once more, from where they are.
+    `search` is `config.search` of the network.
     """
     with clock("selection"):
         first = chosen(found, probabilities.found, on_device, config)
@@ -75,6 +76,8 @@ def choose_and_refine(
     for _ in range(config.next_best):
         with clock("selection"):
             sure = best.candidates.T_camera_object[best.selection.kept & (best.probability >= config.sure)]
+            if not len(sure):
+                break
             rows = next_best_rows(found, np.concatenate(tried), sure, probabilities.found, on_device, config)
         if not len(rows):
             break

@@ -25,8 +25,9 @@ class DetectConfig:
     promising: float = 0.1  # that from which on such a pose, in a new place, is a reason to go on, as likely ones are
     accepted: float = 0.8  # that from which on a pose counts as found: in world bins 95% of such poses are right
     reported: float = 0.1  # less probable poses are left out
-    # Poses of a place that are refined after the best one, as long as none of it is `sure`: of that probability. Those
-    # that stand and are not sure are then refined once more. 4 and 0.9 find more, see docs/detect.md.
+    # Poses of a place that are refined after the best one, as long as none of it is `sure`: of that probability, but
+    # another one of the scene is. Those that stand and are not sure are then refined once more. 4 and 0.9 find more:
+    # see docs/detect.md.
     next_best: int = 0
     sure: float = 0.0
 

@@ -127,19 +127,27 @@ def test_what_stays_doubtful_is_refined_once_more_from_where_it_is(monkeypatch: 
 
 
 def test_forms_of_candidates_that_were_refined_later_are_known_by_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = candidates((0.0, 3.0), (FAR, 2.0), (APART, 0.0), (FAR + APART, -0.5))
-    become = {0: [0.0], 1: [0.1], 2: [0.2, 0.3], 3: [0.4, 2.0]}
+    found = candidates((0.0, 3.0), (FAR, 2.0), (APART, 0.0), (FAR + APART, -0.5), (-FAR, 4.0))
+    become = {0: [0.0], 1: [0.1], 2: [0.2, 0.3], 3: [0.4, 2.0], 4: [5.0]}
     turns, choice = refine(monkeypatch, found, become, turned={3: 1.0})
-    assert turns == [[0, 1], [2, 3], [2, 3]]
-    assert stand(choice) == pytest.approx({2: 0.3, 3: 2.0})
+    assert turns == [[0, 1, 4], [2, 3], [2, 3]]
+    assert stand(choice) == pytest.approx({2: 0.3, 3: 2.0, 4: 5.0})
     depth = choice.candidates.T_camera_object[choice.selection.kept, 2, 3]
-    assert depth.tolist() == pytest.approx([9.0 + 2 * MOVE, 9.0 + 3 * MOVE])
+    assert depth.tolist() == pytest.approx([9.0 + MOVE, 9.0 + 2 * MOVE, 9.0 + 3 * MOVE])
 
 
 def test_what_would_become_the_same_pose_or_is_hardly_probable_is_not_refined(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = candidates((0.0, 3.0), (0.02 * BOX.diameter, 1.0), (APART, -4.0))
-    turns, _ = refine(monkeypatch, found, {0: [0.0, 0.0]})
-    assert turns == [[0], [0]]
+    found = candidates((0.0, 3.0), (0.02 * BOX.diameter, 1.0), (APART, -4.0), (FAR, 4.0))
+    turns, _ = refine(monkeypatch, found, {0: [0.0, 0.0], 3: [5.0]})
+    assert turns == [[0, 3], [0]]
+
+
+def test_where_nothing_is_sure_no_others_are_refined(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = candidates((0.0, 3.0), (APART, 1.0), (FAR, 4.0))
+    become = {0: [0.0, 0.1], 1: [0.0], 2: [2.0, 2.1]}
+    assert refine(monkeypatch, found, become)[0] == [[0, 2], [0, 2]]
+    become[2] = [2.5]
+    assert refine(monkeypatch, found, become)[0] == [[0, 2], [1], [0]]
 
 
 def test_what_looks_like_one_that_was_tried_is_not_refined(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -191,10 +199,10 @@ def tilts(count: int) -> list[np.ndarray]:
 
 
 def test_settings_say_how_many_are_refined(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = candidates((0.0, 4.0), (APART, 3.0), (-APART, 2.0), (2 * APART, 1.0))
-    become = {number: [0.0, 0.0] for number in range(4)}
-    assert refine(monkeypatch, found, become, replace(CONFIG, next_best=1))[0] == [[0], [1], [0]]
-    assert refine(monkeypatch, found, become, DetectConfig())[0] == [[0]]
+    found = candidates((0.0, 4.0), (APART, 3.0), (-APART, 2.0), (2 * APART, 1.0), (FAR, 4.0))
+    become = {number: [0.0, 0.0] for number in range(4)} | {4: [5.0]}
+    assert refine(monkeypatch, found, become, replace(CONFIG, next_best=1))[0] == [[0, 4], [1], [0]]
+    assert refine(monkeypatch, found, become, DetectConfig())[0] == [[0, 4]]
     assert len(refine(monkeypatch, found, become)[0]) == 5
     with pytest.raises(InputError, match="next_best = -1"):
         DetectConfig(next_best=-1)

@@ -200,6 +200,13 @@ def test_poses_that_are_neither_right_nor_wrong_are_stored_alone(tmp_path: Path,
     np.testing.assert_array_equal(poses["T_camera_object"][:, 0, 3], [0, 1, 3, 4, 5])
 
 
+def test_poses_that_detection_would_not_have_come_to_are_not_fitted_to(tmp_path: Path, network: Model) -> None:
+    path = tmp_path / "poses.npz"
+    store(path, network, turn=np.array([-1, 0, 1, 2, -1, 0]), due=np.array([False, True, False, True, False, True]))
+    poses = poses_to_fit(Sources(), FitOptions(), network, path)
+    np.testing.assert_array_equal(poses["T_camera_object"][:, 0, 3], [0, 1, 3, 4, 5])
+
+
 def test_another_method_does_not_replace_what_is_shipped() -> None:
     with pytest.raises(InputError, match="--output"):
         calibrate(Options(method="FPFH"))
@@ -232,6 +239,9 @@ def test_of_later_turns_detection_sees_what_is_not_near_a_sure_pose(motor: Devic
     kept, due = module._chosen_in_turns(found, turns, exact, exact, motor)
     assert due.tolist() == [True, False, True, True, False, False]
     assert kept.tolist() == [True, False, False, True, False, False]
+    evidence[0, 0] = 2.0  # nothing is sure any more
+    kept, due = module._chosen_in_turns(found, turns, exact, exact, motor)
+    assert due.tolist() == [True, False, True, False, False, False]
     kept, due = module._chosen_in_turns(found, np.minimum(turns, 0), exact, exact, motor)
     assert due.tolist() == [True] * 5 + [False]
     assert kept.tolist() == [False, True, False, False, True, False]
