@@ -44,7 +44,7 @@ from kmn_jax.files import make_folder, write_whole
 from kmn_jax.models import Model
 from kmn_jax.objects import model_digest
 
-_CONFIG = DetectConfig(next_best=4, sure=0.9)  # of the detection that probabilities are for
+_CONFIG = DetectConfig()  # of the detection that probabilities are for
 _LOOSE = replace(_CONFIG, reported=0.03)  # refines more than that does, so that the fit sees what is just refused
 _COLUMNS = (  # of what is stored
     "evidence",
@@ -56,8 +56,8 @@ _COLUMNS = (  # of what is stored
     "narrowed",
     "T_camera_object",
     "refined",
-    "turn",  # of which they are of what detection refines; none, -1, is of poses as they were found and of others
-    "due",  # whether they are of what detection chooses among: the first turn, and others where nothing was sure
+    "turn",  # in which detection refines them; -1 as they are found, and if they are just not probable enough
+    "due",  # whether detection, which is not always for later turns, comes to them, and chooses among them
     "reported",
 )
 _HOW = 9  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
@@ -317,10 +317,8 @@ def _chosen_in_turns(
 ) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
     """Return which refined poses detection reports, and among which it chooses.
 
-    Later ones are seen where some pose is sure, but not in its place.
-
-    Which are sure is told before the model is scaled, and poses do not vouch for each other; nor is known what would
-    become of doubtful ones that are refined once more.
+    Later turns come where some pose is sure, but not in its place. Which are sure is told before the model is scaled,
+    and poses do not vouch for each other; nor is known what would become of doubtful ones that are refined once more.
     """
 
     def kept_of(rows: Bool[np.ndarray, " s"]) -> Bool[np.ndarray, " s"]:

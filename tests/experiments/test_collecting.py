@@ -28,8 +28,9 @@ def network() -> Model:
     return create_model(TINY, jax.random.key(0))
 
 
-def test_candidates_are_refined_in_the_turns_of_detection() -> None:
+def test_candidates_are_refined_in_the_turns_of_detection(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last three, in a row, lie in each other's places: the third of them is just not probable enough."""
+    monkeypatch.setattr(module, "_CONFIG", DetectConfig(next_best=4, sure=0.9))
     part = on_device(box_part())
     places, odds = [9.0, 9.06, 0.0, 0.4, 0.8], [3.0, 1.0, 3.0, 0.0, -3.0]
     poses = np.tile(np.eye(4, dtype=np.float32), (5, 1, 1))
@@ -43,6 +44,9 @@ def test_candidates_are_refined_in_the_turns_of_detection() -> None:
     assert (rows.tolist(), turns.tolist()) == ([0, 2, 1, 3, 4], [0, 0, 1, 1, -1])
     rows, turns = module._turns(found._replace(usable=np.arange(5) == 4), model, part)
     assert (rows.tolist(), turns.tolist()) == ([4], [-1])
+    monkeypatch.setattr(module, "_CONFIG", DetectConfig(next_best=0))
+    rows, turns = module._turns(found, model, part)
+    assert (rows.tolist(), turns.tolist()) == ([0, 2, 3, 4], [0, 0, -1, -1])
 
 
 class Asked:
