@@ -115,9 +115,16 @@ def in_places_of(
     poses: Float32[np.ndarray, "s 4 4"], others: Float32[np.ndarray, "t 4 4"], part: DevicePart
 ) -> Bool[np.ndarray, " s"]:
     """Return which poses have their middle as near to that of another one as poses of one copy may."""
+    nearest: Float[np.ndarray, " s"] = _apart(poses, others, part).min(axis=1, initial=np.inf)
+    return nearest <= float(part.reach)
+
+
+def _apart(
+    poses: Float32[np.ndarray, "s 4 4"], others: Float32[np.ndarray, "t 4 4"], part: DevicePart
+) -> Float[np.ndarray, "s t"]:
+    """Return how far the part's middle at each pose is from that at each other one."""
     middle = np.asarray(part.arrays.points).mean(axis=0)[None]
-    apart = np.linalg.norm(_placed(poses, middle) - _placed(others, middle)[:, 0], axis=2)
-    return (apart <= float(part.reach)).any(axis=1)
+    return np.linalg.norm(_placed(poses, middle) - _placed(others, middle)[:, 0], axis=2)
 
 
 def _alike(
@@ -127,16 +134,16 @@ def _alike(
 
     Of continuous symmetries there are steps: what is turned by half of one may count as another pose.
     """
-    points, symmetries = np.asarray(part.arrays.points), np.unique(np.asarray(part.symmetries), axis=0)
-    diameter, surface = float(part.arrays.diameter), points[:_POINTS]
-    middle = points.mean(axis=0)[None]
-    centers, tried_centers = _placed(poses, middle)[:, 0], _placed(tried, middle)[:, 0]
+    symmetries = np.unique(np.asarray(part.symmetries), axis=0)
+    diameter, surface = float(part.arrays.diameter), np.asarray(part.arrays.points)[:_POINTS]
     places, result = _placed(poses, surface), np.zeros(len(poses), dtype=bool)
-    at_once = max(1, _NUMBERS // (symmetries.shape[0] * surface.size))
-    for pose, center in zip(tried, tried_centers, strict=True):
+    at_once = max(1, _NUMBERS // (len(symmetries) * surface.size))
+    for pose, is_near in zip(tried, (_apart(poses, tried, part) <= _APART * diameter).T, strict=True):
+        near = np.flatnonzero(is_near & ~result)
+        if not len(near):
+            continue
         turned = _placed(pose @ symmetries, surface)
-        near = ~result & (np.linalg.norm(centers - center, axis=1) <= _APART * diameter)
-        for rows in np.array_split(np.flatnonzero(near), -(-near.sum() // at_once) or 1):
+        for rows in np.array_split(near, -(-len(near) // at_once)):
             farthest = ((places[rows, None] - turned) ** 2).sum(axis=3).max(axis=2)
             result[rows] = (farthest <= (_OTHER * diameter) ** 2).any(axis=1)
     return result
