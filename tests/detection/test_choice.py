@@ -202,7 +202,8 @@ def test_settings_say_how_many_are_refined(monkeypatch: pytest.MonkeyPatch) -> N
     found = candidates((0.0, 4.0), (APART, 3.0), (-APART, 2.0), (2 * APART, 1.0), (FAR, 4.0))
     become = {number: [0.0, 0.0] for number in range(4)} | {4: [5.0]}
     assert refine(monkeypatch, found, become, replace(CONFIG, next_best=1))[0] == [[0, 4], [1], [0]]
-    assert refine(monkeypatch, found, become, replace(CONFIG, next_best=0))[0] == [[0, 4]]
+    assert refine(monkeypatch, found, become, replace(CONFIG, next_best=0))[0] == [[0, 4], [0]]
+    assert refine(monkeypatch, found, become, replace(CONFIG, next_best=0, sure=0.0))[0] == [[0, 4]]
     assert len(refine(monkeypatch, found, become)[0]) == 5
     with pytest.raises(InputError, match="next_best = -1"):
         DetectConfig(next_best=-1)
