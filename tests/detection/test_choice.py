@@ -199,12 +199,13 @@ def tilts(count: int) -> list[np.ndarray]:
 
 
 def test_settings_say_how_many_are_refined(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = candidates((0.0, 4.0), (APART, 3.0), (-APART, 2.0), (2 * APART, 1.0), (FAR, 4.0))
-    become = {number: [0.0, 0.0] for number in range(4)} | {4: [5.0]}
-    assert refine(monkeypatch, found, become, replace(CONFIG, next_best=1))[0] == [[0, 4], [1], [0]]
-    assert refine(monkeypatch, found, become, replace(CONFIG, next_best=0))[0] == [[0, 4], [0]]
-    assert refine(monkeypatch, found, become, replace(CONFIG, next_best=0, sure=0.0))[0] == [[0, 4]]
-    assert len(refine(monkeypatch, found, become)[0]) == 5
+    others = ((APART, 3.0), (-APART, 2.0), (2 * APART, 1.0), (-2 * APART, 0.5), (3 * APART, 0.2))
+    found = candidates((0.0, 4.0), *others, (FAR, 4.0))
+    become = {number: [0.0, 0.0] for number in range(6)} | {6: [5.0]}
+    assert refine(monkeypatch, found, become)[0] == [[0, 6], [1], [2], [3], [4], [0]]
+    assert refine(monkeypatch, found, become, replace(CONFIG, next_best=1))[0] == [[0, 6], [1], [0]]
+    assert refine(monkeypatch, found, become, replace(CONFIG, next_best=0))[0] == [[0, 6], [0]]
+    assert refine(monkeypatch, found, become, replace(CONFIG, next_best=0, sure=0.0))[0] == [[0, 6]]
     with pytest.raises(InputError, match="next_best = -1"):
         DetectConfig(next_best=-1)
     with pytest.raises(InputError, match="sure = 2"):
