@@ -9,14 +9,13 @@ takes hours: name a file by `--candidates`, and what was searched before it is e
 again. A model of the evidence is fitted to whether they are right. Probabilities are also predicted by models that were
 fitted without the image's object, which gives the reliability that is printed. The model of poses as they are found is
 fitted first, to those around the seeds that detection begins with. Then each search is made as a whole, round after
-round, by such a model that does not know the image's object, and what it refines, turn by turn as detection does, is
-what the model of refined poses is fitted to, with what it just refuses. Of known worlds nothing is refined:
-`experiments.train_verifier` learns from what is found first, so that what the verifier says there is no evidence. Of
-refined poses detection reports one for each place: the one that a third model holds for the most probable, which is
-fitted to whether all points are in their places (MSSD), and not their mean (ADI). Models are too sure of themselves
-about kinds of objects that they were not fitted to: so the scales of the refined poses' models are fitted to what
-detection would report by models that do not know the kind. From the same poses, of scans of which is known where parts
-are, a fourth model learns what poses of one scene say about each other.
+round, by such a model that does not know the image's object, and what it refines is what the model of refined poses is
+fitted to. Of known worlds nothing is refined: `experiments.train_verifier` learns from what is found first, so that
+what the verifier says there is no evidence. Of refined poses detection reports one for each place: the one that a third
+model holds for the most probable, which is fitted to whether all points are in their places (MSSD), and not their mean
+(ADI). Models are too sure of themselves about kinds of objects that they were not fitted to: so the scales of the
+refined poses' models are fitted to what detection would report by models that do not know the kind. From the same
+poses, of scans of which is known where parts are, a fourth model learns what poses of one scene say about each other.
 """
 
 from __future__ import annotations

@@ -317,9 +317,8 @@ def _chosen_in_turns(
 ) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
     """Return which refined poses detection reports, and among which it chooses.
 
-    Later turns come where some pose is sure, but not in its place. Which are sure is told before the model is scaled
-    and what is buried limited, and poses do not vouch for each other; nor is known what would become of doubtful ones
-    that are refined once more.
+    Later turns come where some pose is sure, but not in its place. Which are sure is told before the model is scaled,
+    and poses do not vouch for each other; nor is known what would become of doubtful ones that are refined once more.
     """
 
     def kept_of(rows: Bool[np.ndarray, " s"]) -> Bool[np.ndarray, " s"]:

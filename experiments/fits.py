@@ -26,7 +26,6 @@ from kmn_jax.detection import (
 from kmn_jax.errors import InputError, require
 
 _SCALE_RIDGE = 1e-4  # hardly any: it makes probabilities too modest
-_BURIED = ("buried", "buried_between", "buried_deep", "around_buried")  # shares of a pose below what surrounds it
 
 
 @dataclass(frozen=True)
@@ -37,13 +36,11 @@ class FitOptions:
     members: int = 3  # fits, whose mean is the model of refined poses
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
     reported_weight: float = 8.0  # of poses that detection reports: what is said of them is what users are told
-    buried: float = 0.9  # share of right poses that are all buried less than what counts as most
     in_vain: float | None = None  # tell as if this share of the searches was in vain; none: as many as there were
 
     def __post_init__(self) -> None:
         """Refuse values that contradict their meaning."""
         require(self.in_vain is None or 0 < self.in_vain < 1, f"in_vain = {self.in_vain} must be between 0 and 1")
-        require(0 < self.buried <= 1, f"buried = {self.buried} must be above 0, and at most 1")
 
 
 def by_largest_error(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -77,32 +74,11 @@ def _folds(poses: dict[str, np.ndarray], options: FitOptions) -> list[Int[np.nda
 
 
 def model_of(poses: dict[str, np.ndarray], options: FitOptions) -> Calibration:
-    """Return the model that is fitted to those poses that are `told`.
-
-    If any is as it was found, it is of one member; of refined ones it counts only up to a limit how much is buried.
-    """
-    are_refined = bool(poses["refined"].all())
+    """Return the model that is fitted to those poses that are `told`, of one member if any is as it was found."""
+    members = options.members if poses["refined"].all() else 1  # one is enough to choose what is refined
     poses = told(poses)
     right, weights = poses["error"] < THRESHOLD, weights_of(poses, options)
-    if not are_refined:  # one is enough to choose what is refined
-        return fit_calibration(poses["evidence"], right, EVIDENCE, weights)
-    evidence = _limited(poses["evidence"], right & poses["reported"], options.buried)
-    return fit_calibration(evidence, right, EVIDENCE, weights, members=options.members)
-
-
-def _limited(
-    evidence: Float[np.ndarray, "s f"], right: Bool[np.ndarray, " s"], share: float
-) -> Float[np.ndarray, "s f"]:
-    """Return evidence in which no pose is buried more than a share of the right ones, if there are any.
-
-    Trees that are fitted to it tell none beyond apart, so it need not be done where they are used. How much of copies
-    lies below what surrounds them is a matter of the heaps that were made; in real scans it is more. Right ones are
-    those that are known to be reported: until that is known, there is no limit.
-    """
-    evidence, columns = evidence.copy(), [EVIDENCE.index(name) for name in _BURIED]
-    if right.any():
-        evidence[:, columns] = np.minimum(evidence[:, columns], np.quantile(evidence[right][:, columns], share, axis=0))
-    return evidence
+    return fit_calibration(poses["evidence"], right, EVIDENCE, weights, members=members)
 
 
 def weights_of(poses: dict[str, np.ndarray], options: FitOptions) -> Float[np.ndarray, " s"]:

@@ -5,7 +5,7 @@ worlds, once they are moved onto the depth image, as those that it is shown are;
 How it does on the refined poses of all other images, to which probabilities are fitted, is told, and nothing is chosen
 by it. What verifiers are shown of all poses takes an hour, and gigabytes of a folder beside FILE: what was ended goes
 on where it was until the network itself is trained, in half an hour. Afterwards raise the number of
-`kmn_jax.detection.VERIFIED`, and fit again, as docs/detect.md says: stored poses are judged anew.
+`kmn_jax.detection.VERIFIED`, and fit again by the same FILE, whose poses are judged anew.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Which candidates are refined, and which of them stand: the best of each place and, where none is sure, the next ones.
+"""Which candidates are refined, and which of them stand: the best of each place and, where that is asked for, others.
 
 What is said of a pose as it was found is rough: of several in one place, another one may become the better pose once
-all are refined. So, once some pose of the scene is sure, up to `DetectConfig.next_best` more of them are refined in
-each place where none is.
+all are refined. So `DetectConfig.next_best` refines more of them, once some pose of the scene is sure, in each place
+where none is.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ from tests.reference.parts import box_part, on_device
 
 BOX = box_part()
 Z = np.array([0.0, 0.0, 1.0])
-CONFIG = DetectConfig()
+CONFIG = DetectConfig(next_best=4, sure=0.9)
 
 
 def by(column: int) -> Calibration:

@@ -231,6 +231,7 @@ def test_of_later_turns_detection_sees_what_is_not_near_a_sure_pose(
     motor: DevicePart, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where the first copy is sure, of the second one a pose of the second turn becomes so, before the third."""
+    monkeypatch.setattr(module, "_CONFIG", DetectConfig(next_best=4, sure=0.9))
     places, odds = [0.0, 0.02, 5.0, 5.02, 5.04, 0.04], [4.0, 5.0, 0.0, 4.0, 6.0, 7.0]
     turns, exact = np.array([0, 1, 0, 1, 2, -1]), Calibration(EVIDENCE, (1.0,) + (0.0,) * (len(EVIDENCE) - 1), 0.0)
     poses = np.tile(np.eye(4, dtype=np.float32), (6, 1, 1))

@@ -32,7 +32,6 @@ def drawn(random_seed: int, objects: int = _OBJECTS, spread: float = 1.0, oddity
 @pytest.fixture(autouse=True)
 def few_columns(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fits, "EVIDENCE", tuple(f"column {number}" for number in range(_COLUMNS)))
-    monkeypatch.setattr(fits, "_BURIED", ())
 
 
 def test_probabilities_hold_for_objects_of_other_kinds() -> None:
@@ -157,24 +156,3 @@ def test_where_probable_poses_are_wrong_no_scale_is_fitted() -> None:
     poses["object"] = poses["object"] % 2
     with pytest.raises(InputError, match="give more bins"):
         fit(poses, FitOptions(absent_weight=1.0, folds=2, members=2))
-
-
-def test_what_is_buried_counts_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It tells right from wrong: more than most right poses have tells no more."""
-    monkeypatch.setattr(fits, "_BURIED", ("column 0", "column 1"))
-    poses = drawn(0)
-    right, rng = poses["error"] < 0.1, np.random.default_rng(1)
-    poses["evidence"][:, 0] = rng.exponential(size=len(right)) * np.where(right, 1.0, 3.0)
-    limit = np.quantile(poses["evidence"][right & poses["reported"], 0], 0.9)
-    more = np.zeros((3, _COLUMNS))
-    more[:, 0] = (0.5 * limit, 1.01 * limit, 3 * limit)
-    for share, is_limited in ((0.9, True), (1.0, False)):
-        own = fits.model_of(poses, FitOptions(members=1, buried=share)).logit(more)
-        assert own[0] > own[1] + 0.1
-        assert (own[1] == own[2]) == is_limited
-    none = np.zeros(len(right), dtype=bool)
-    for others in ({"reported": none}, {"refined": none}):  # not known yet, or as they were found
-        own = fits.model_of(poses | others, FitOptions(members=1)).logit(more)
-        assert own[1] != own[2]
-    with pytest.raises(InputError, match="buried = 0"):
-        FitOptions(buried=0.0)
