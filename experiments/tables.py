@@ -28,14 +28,14 @@ _OTHERS_IN_SHORT = (
     "[other scenes](docs/detect.md#outside-of-these-bins): tables, trays, thick rims, mixed parts, other sensors"
 )
 _RELEASED = (
-    "what is released: whole searches, for up to three objects that are not there, told as if for a quarter; after"
-    " that, noisy images averaged, and searches that go on among what is found, for poses of 0.1"
-    " ([results](results/worlds_test.json))"
+    "what is released: whole searches that refine the next best poses, too, once one of the scene is sure; the rest as"
+    " in the third row, but for what is buried, which counts up to a limit ([results](results/worlds_test.json))"
 )
 _SEARCHES = {
     "fast: one draw": "fast",
     "it goes on for poses of 0.5, `DetectConfig(promising=0.5)`": "goes on from 0.5",
     "usual: up to two draws, and three such rounds": PLAIN,
+    "the best pose of each place alone refined, `DetectConfig(next_best=0, sure=0.0)`": "best alone",
     "up to four draws": "four draws",
     "thorough": "thorough",
 }
