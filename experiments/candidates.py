@@ -86,7 +86,7 @@ def poses_to_fit(sources: Sources, fits: FitOptions, network: Model, stored: Pat
                 " search again"
             )
         if used == EVIDENCE and not sources.judge_anew:
-            return _to_fit(poses | {"evidence": poses["evidence"][:, [names.index(name) for name in EVIDENCE]]})
+            return told(poses | {"evidence": poses["evidence"][:, [names.index(name) for name in EVIDENCE]]})
         unused = [column for column, name in enumerate(names) if name not in EVIDENCE]
         kept = poses["evidence"][:, unused]
         poses = judged_anew(poses, names, sources, fits, network)
@@ -96,13 +96,7 @@ def poses_to_fit(sources: Sources, fits: FitOptions, network: Model, stored: Pat
         made_of = _made_of(sources, fits, network)
         of = {"made_of": made_of, "names": names, "used": EVIDENCE}  # used: for what is reported
         write_columns(stored, poses | {key: np.array(value) for key, value in of.items()})
-    return _to_fit(poses | {"evidence": poses["evidence"][:, : len(EVIDENCE)]})
-
-
-def _to_fit(poses: Columns) -> Columns:
-    """Return poses that are `told`, without those that detection would not have come to: their like is not judged."""
-    not_seen = (poses["turn"] > 0) & ~poses["due"]
-    return told({name: values[~not_seen] for name, values in poses.items()})
+    return told(poses | {"evidence": poses["evidence"][:, : len(EVIDENCE)]})
 
 
 def read_poses(

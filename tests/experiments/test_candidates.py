@@ -200,13 +200,6 @@ def test_poses_that_are_neither_right_nor_wrong_are_stored_alone(tmp_path: Path,
     np.testing.assert_array_equal(poses["T_camera_object"][:, 0, 3], [0, 1, 3, 4, 5])
 
 
-def test_poses_that_detection_would_not_have_come_to_are_not_fitted_to(tmp_path: Path, network: Model) -> None:
-    path = tmp_path / "poses.npz"
-    store(path, network, turn=np.array([-1, 0, 1, 2, -1, 0]), due=np.array([False, True, False, True, False, True]))
-    poses = poses_to_fit(Sources(), FitOptions(), network, path)
-    np.testing.assert_array_equal(poses["T_camera_object"][:, 0, 3], [0, 1, 3, 4, 5])
-
-
 def test_another_method_does_not_replace_what_is_shipped() -> None:
     with pytest.raises(InputError, match="--output"):
         calibrate(Options(method="FPFH"))
