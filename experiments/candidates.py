@@ -31,7 +31,7 @@ from kmn_jax.detection import (
     SearchConfig,
     chosen,
     explore,
-    in_places_of,
+    in_doubtful_places,
     next_best_rows,
     picture_evidence,
     refined_candidates,
@@ -86,7 +86,7 @@ def poses_to_fit(sources: Sources, fits: FitOptions, network: Model, stored: Pat
                 " search again"
             )
         if used == EVIDENCE and not sources.judge_anew:
-            return _to_fit(poses | {"evidence": poses["evidence"][:, [names.index(name) for name in EVIDENCE]]})
+            return told(poses | {"evidence": poses["evidence"][:, [names.index(name) for name in EVIDENCE]]})
         unused = [column for column, name in enumerate(names) if name not in EVIDENCE]
         kept = poses["evidence"][:, unused]
         poses = judged_anew(poses, names, sources, fits, network)
@@ -96,13 +96,7 @@ def poses_to_fit(sources: Sources, fits: FitOptions, network: Model, stored: Pat
         made_of = _made_of(sources, fits, network)
         of = {"made_of": made_of, "names": names, "used": EVIDENCE}  # used: for what is reported
         write_columns(stored, poses | {key: np.array(value) for key, value in of.items()})
-    return _to_fit(poses | {"evidence": poses["evidence"][:, : len(EVIDENCE)]})
-
-
-def _to_fit(poses: Columns) -> Columns:
-    """Return poses that are `told`, without those that detection would not have come to: their like is not judged."""
-    not_seen = (poses["turn"] > 0) & ~poses["due"]
-    return told({name: values[~not_seen] for name, values in poses.items()})
+    return told(poses | {"evidence": poses["evidence"][:, : len(EVIDENCE)]})
 
 
 def read_poses(
@@ -223,15 +217,15 @@ class _Kept:
 def _turns(
     found: Candidates, chooser: Calibration, on_device: DevicePart
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Return the rows of candidates to refine, and the turn in which detection would, if nothing became a sure pose.
+    """Return the rows of candidates to refine, and the turn in which detection would, if all places stayed doubtful.
 
     Those that are just not probable enough for detection, of which there is one turn, are -1.
     """
     loose, first = (chosen(found, chooser, on_device, config) for config in (_LOOSE, _CONFIG))
     rows = [np.flatnonzero(first.kept | first.contenders)]
-    nothing_sure = np.zeros((0, 4, 4), dtype=np.float32)
+    all_doubtful = found.T_camera_object, found.T_camera_object[:0]
     while len(rows[-1]) > 0 and len(rows) <= _CONFIG.next_best:
-        rows.append(next_best_rows(found, np.concatenate(rows), nothing_sure, chooser, on_device, _CONFIG))
+        rows.append(next_best_rows(found, np.concatenate(rows), *all_doubtful, chooser, on_device, _CONFIG))
     others = loose.kept | loose.contenders
     others[np.concatenate(rows)] = False
     rows.append(np.flatnonzero(others))
@@ -317,8 +311,9 @@ def _chosen_in_turns(
 ) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
     """Return which refined poses detection reports, and among which it chooses.
 
-    Later turns come where some pose is sure, but not in its place. Which are sure is told before the model is scaled,
-    and poses do not vouch for each other; nor is known what would become of doubtful ones that are refined once more.
+    Later turns come where some pose is sure, but in its place a doubtful one stands. Which are sure is told before the
+    model is scaled, and poses do not vouch for each other; nor is known what would become of doubtful ones that are
+    refined once more.
     """
 
     def kept_of(rows: Bool[np.ndarray, " s"]) -> Bool[np.ndarray, " s"]:
@@ -330,7 +325,8 @@ def _chosen_in_turns(
         sure = kept & (model.probability(found.evidence) >= _CONFIG.sure)
         if not sure.any():
             break
-        more = (turns == turn) & ~in_places_of(found.T_camera_object, found.T_camera_object[sure], on_device)
+        standing = (found.T_camera_object[of] for of in (kept & ~sure, sure))
+        more = (turns == turn) & in_doubtful_places(found.T_camera_object, *standing, on_device)
         if more.any():
             due |= more
             kept = kept_of(due)

@@ -45,7 +45,7 @@ SETTINGS = {
     "fast, patience 4": replace(FAST, patience=4),
     "fast, all finely": replace(FAST, patience=None),
     PLAIN: _USUAL,
-    "next best": replace(_USUAL, next_best=4, sure=0.9),
+    "best alone": replace(_USUAL, next_best=0, sure=0.0),
     "patience 2": replace(_USUAL, patience=2),
     "goes on from 0.5": replace(_USUAL, promising=0.5),
     "goes on from 0.2": replace(_USUAL, promising=0.2),

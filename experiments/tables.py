@@ -36,6 +36,7 @@ _SEARCHES = {
     "fast: one draw": "fast",
     "it goes on for poses of 0.5, `DetectConfig(promising=0.5)`": "goes on from 0.5",
     "usual: up to two draws, and three such rounds": PLAIN,
+    "the best pose of each place alone refined, `DetectConfig(next_best=0, sure=0.0)`": "best alone",
     "up to four draws": "four draws",
     "thorough": "thorough",
 }

@@ -1,8 +1,8 @@
-"""Which candidates are refined, and which of them stand: the best of each place and, where that is asked for, others.
+"""Which candidates are refined, and which of them stand: the best of each place and, where that stays doubtful, others.
 
 What is said of a pose as it was found is rough: of several in one place, another one may become the better pose once
-all are refined. So `DetectConfig.next_best` refines more of them, once some pose of the scene is sure, in each place
-where none is.
+all are refined. So, once some pose of the scene is sure, up to `DetectConfig.next_best` more of them are refined in
+each place of a doubtful one.
 """
 
 from __future__ import annotations
@@ -55,8 +55,9 @@ def choose_and_refine(
     """Return refined candidates, and the choice among them; what was found as it is where nothing of it is chosen.
 
     Refined are the most probable one of each place and a contender; then, up to `config.next_best` times, the next one
-    of each place that no sure pose is in, once one of the scene is sure: a part that is not there would only have more
-    chances to be mistaken. In the end those that stand and are not sure are refined once more, from where they are.
+    of each place in which a doubtful pose stands, once one of the scene is sure: a part that is not there would only
+    have more chances to be mistaken, and of the many places where nothing stands few have one. In the end those that
+    stand and are not sure are refined once more, from where they are.
     `search` is `config.search` of the network.
     """
     with clock("selection"):
@@ -76,10 +77,11 @@ def choose_and_refine(
     best, tried = judged(refined(rows)), [rows]
     for _ in range(config.next_best):
         with clock("selection"):
-            sure = best.candidates.T_camera_object[best.selection.kept & (best.probability >= config.sure)]
-            if not len(sure):
+            is_sure = best.selection.kept & (best.probability >= config.sure)
+            standing = (best.candidates.T_camera_object[of] for of in (best.selection.kept & ~is_sure, is_sure))
+            if not is_sure.any():
                 break
-            rows = next_best_rows(found, np.concatenate(tried), sure, probabilities.found, on_device, config)
+            rows = next_best_rows(found, np.concatenate(tried), *standing, probabilities.found, on_device, config)
         if not len(rows):
             break
         best = judged(_together(best.candidates, refined(rows)))
@@ -95,29 +97,35 @@ def choose_and_refine(
 def next_best_rows(
     found: Candidates,
     tried: Int[np.ndarray, " k"],
+    doubtful: Float32[np.ndarray, "d 4 4"],
     sure: Float32[np.ndarray, "t 4 4"],
     calibration: Calibration,
     part: DevicePart,
     config: DetectConfig,
 ) -> Int[np.ndarray, " b"]:
-    """Return the rows of the most probable candidate of each place that no `sure` pose is in.
+    """Return the rows of the most probable candidate of each place that a `doubtful` pose is in, and no `sure` one.
 
     Candidates that are like those in the rows that were `tried` are left out.
     """
     rows = np.flatnonzero(found.usable)
-    rows = rows[~in_places_of(found.T_camera_object[rows], sure, part)]
+    rows = rows[in_doubtful_places(found.T_camera_object[rows], doubtful, sure, part)]
     rows = rows[~_alike(found.T_camera_object[rows], found.T_camera_object[tried], part)]
     usable = np.zeros_like(found.usable)
     usable[rows] = True
     return np.flatnonzero(chosen(found._replace(usable=usable), calibration, part, config).kept)
 
 
-def in_places_of(
-    poses: Float32[np.ndarray, "s 4 4"], others: Float32[np.ndarray, "t 4 4"], part: DevicePart
+def in_doubtful_places(
+    poses: Float32[np.ndarray, "s 4 4"],
+    doubtful: Float32[np.ndarray, "d 4 4"],
+    sure: Float32[np.ndarray, "t 4 4"],
+    part: DevicePart,
 ) -> Bool[np.ndarray, " s"]:
-    """Return which poses have their middle as near to that of another one as poses of one copy may."""
-    nearest: Float[np.ndarray, " s"] = _apart(poses, others, part).min(axis=1, initial=np.inf)
-    return nearest <= float(part.reach)
+    """Return which poses have their middle as near to that of a doubtful one, and of no sure one, as one copy may."""
+    near_doubtful, near_sure = (
+        _apart(poses, others, part).min(axis=1, initial=np.inf) <= float(part.reach) for others in (doubtful, sure)
+    )
+    return near_doubtful & ~near_sure
 
 
 def _apart(

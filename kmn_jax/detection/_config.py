@@ -25,11 +25,11 @@ class DetectConfig:
     promising: float = 0.1  # that from which on such a pose, in a new place, is a reason to go on, as likely ones are
     accepted: float = 0.8  # that from which on a pose counts as found: in world bins 95% of such poses are right
     reported: float = 0.1  # less probable poses are left out
-    # Poses of a place that are refined after the best one, as long as none of it is `sure`: of that probability, but
-    # another one of the scene is. Those that stand and are not sure are then refined once more. 4 and 0.9 find more:
-    # see docs/detect.md.
-    next_best: int = 0
-    sure: float = 0.0
+    # Poses of a place that are refined after the best one, as long as the one that stands there is not `sure`: of that
+    # probability, but another one of the scene is. Those that stand and are not sure are then refined once more. 0 and
+    # 0.0 leave it at the best ones: docs/detect.md says what that loses.
+    next_best: int = 4
+    sure: float = 0.9
 
     def __post_init__(self) -> None:
         if self.patience is not None and self.patience < 1:

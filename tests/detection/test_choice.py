@@ -1,4 +1,4 @@
-"""Which candidates are refined: the best of each place, and others where that one becomes no sure pose."""
+"""Which candidates are refined: the best of each place, and others where that one stays doubtful."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from tests.reference.parts import box_part, on_device
 
 BOX = box_part()
 Z = np.array([0.0, 0.0, 1.0])
-CONFIG = DetectConfig(next_best=4, sure=0.9)
+CONFIG = DetectConfig()
 
 
 def by(column: int) -> Calibration:
@@ -148,6 +148,14 @@ def test_where_nothing_is_sure_no_others_are_refined(monkeypatch: pytest.MonkeyP
     assert refine(monkeypatch, found, become)[0] == [[0, 2], [0, 2]]
     become[2] = [2.5]
     assert refine(monkeypatch, found, become)[0] == [[0, 2], [1], [0]]
+
+
+def test_where_nothing_stands_no_others_are_refined(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two places with candidates to try, in one the pose that was refined is too improbable to be reported."""
+    found = candidates((0.0, 3.0), (APART, 2.0), (FAR, 3.0), (FAR + APART, 2.0), (-FAR, 4.0))
+    turns, choice = refine(monkeypatch, found, {0: [-3.0], 2: [-2.0, -2.0], 3: [-1.0, -1.0], 4: [5.0]})
+    assert turns == [[0, 2, 4], [3], [3]]
+    assert stand(choice) == {3: -1.0, 4: 5.0}
 
 
 def test_what_looks_like_one_that_was_tried_is_not_refined(monkeypatch: pytest.MonkeyPatch) -> None:

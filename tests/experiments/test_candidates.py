@@ -200,13 +200,6 @@ def test_poses_that_are_neither_right_nor_wrong_are_stored_alone(tmp_path: Path,
     np.testing.assert_array_equal(poses["T_camera_object"][:, 0, 3], [0, 1, 3, 4, 5])
 
 
-def test_poses_that_detection_would_not_have_come_to_are_not_fitted_to(tmp_path: Path, network: Model) -> None:
-    path = tmp_path / "poses.npz"
-    store(path, network, turn=np.array([-1, 0, 1, 2, -1, 0]), due=np.array([False, True, False, True, False, True]))
-    poses = poses_to_fit(Sources(), FitOptions(), network, path)
-    np.testing.assert_array_equal(poses["T_camera_object"][:, 0, 3], [0, 1, 3, 4, 5])
-
-
 def test_another_method_does_not_replace_what_is_shipped() -> None:
     with pytest.raises(InputError, match="--output"):
         calibrate(Options(method="FPFH"))
@@ -227,11 +220,10 @@ def test_poses_are_chosen_among_as_those_of_a_search(motor: DevicePart) -> None:
     assert 0 < few.sum() < len(few)
 
 
-def test_of_later_turns_detection_sees_what_is_not_near_a_sure_pose(
+def test_of_later_turns_detection_sees_what_is_near_a_doubtful_pose(
     motor: DevicePart, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where the first copy is sure, of the second one a pose of the second turn becomes so, before the third."""
-    monkeypatch.setattr(module, "_CONFIG", DetectConfig(next_best=4, sure=0.9))
     places, odds = [0.0, 0.02, 5.0, 5.02, 5.04, 0.04], [4.0, 5.0, 0.0, 4.0, 6.0, 7.0]
     turns, exact = np.array([0, 1, 0, 1, 2, -1]), Calibration(EVIDENCE, (1.0,) + (0.0,) * (len(EVIDENCE) - 1), 0.0)
     poses = np.tile(np.eye(4, dtype=np.float32), (6, 1, 1))
@@ -242,7 +234,10 @@ def test_of_later_turns_detection_sees_what_is_not_near_a_sure_pose(
     kept, due = module._chosen_in_turns(found, turns, exact, exact, motor)
     assert due.tolist() == [True, False, True, True, False, False]
     assert kept.tolist() == [True, False, False, True, False, False]
-    evidence[0, 0] = 2.0  # nothing is sure any more
+    evidence[2, 0] = -3.0  # nothing stands where the second copy is
+    kept, due = module._chosen_in_turns(found, turns, exact, exact, motor)
+    assert due.tolist() == [True, False, True, False, False, False]
+    evidence[0, 0], evidence[2, 0] = 2.0, 0.0  # nothing is sure any more
     kept, due = module._chosen_in_turns(found, turns, exact, exact, motor)
     assert due.tolist() == [True, False, True, False, False, False]
     kept, due = module._chosen_in_turns(found, np.minimum(turns, 0), exact, exact, motor)

@@ -30,7 +30,6 @@ def network() -> Model:
 
 def test_candidates_are_refined_in_the_turns_of_detection(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last three, in a row, lie in each other's places: the third of them is just not probable enough."""
-    monkeypatch.setattr(module, "_CONFIG", DetectConfig(next_best=4, sure=0.9))
     part = on_device(box_part())
     places, odds = [9.0, 9.06, 0.0, 0.4, 0.8], [3.0, 1.0, 3.0, 0.0, -3.0]
     poses = np.tile(np.eye(4, dtype=np.float32), (5, 1, 1))

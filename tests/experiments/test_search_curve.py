@@ -34,8 +34,8 @@ def test_settings_differ_in_what_their_names_say() -> None:
         patience = None if "all finely" in name else rounds[0]
         promising = [float(number) for number in re.findall(r"goes on from ([\d.]+)", name)] or [base.promising]
         expected = replace(base, patience=patience, promising=promising[0])
-        if name == "next best":
-            expected = replace(expected, next_best=4, sure=0.9)
+        if name == "best alone":
+            expected = replace(expected, next_best=0, sure=0.0)
         assert replace(config, search=base.search) == expected
 
 
