@@ -98,6 +98,7 @@ FAMILIES = (
     Family("active stereo", sensor="stereo"),
     Family("time of flight", sensor="time_of_flight"),
     Family("touching rows", rows=True, height=(0.1, 0.4), copies=(4, 12)),
+    Family("full bin", half=(1.2, 1.8), height=(1.0, 1.6), copies=(30, 70)),
 )
 
 

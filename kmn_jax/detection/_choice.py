@@ -26,8 +26,9 @@ from kmn_jax.detection._search import Candidates, SearchConfig, seed_keys
 from kmn_jax.detection._selection import Selection, select_poses
 from kmn_jax.detection._timing import Clock
 from kmn_jax.detection._verification import VERIFIED, verified
+from kmn_jax.programs import compiled_size
 
-_CONSIDERED = 128  # most probable poses that are compared with each other: one number, so one compilation
+_FEWEST = 128  # poses that programs which compare them are compiled for
 _POINTS = 16  # on the surface, by which candidates are told apart
 _OTHER = 0.05  # diameters: a candidate that is nowhere farther from one that was refined would become the same pose
 _APART = 2 * _OTHER  # centres of mass of such candidates, as sampled, are no farther apart
@@ -235,13 +236,14 @@ def chosen(
     config: DetectConfig,
     exact: Calibration | None = None,
 ) -> Selection:
-    """Choose among the most probable candidates, by an `exact` model where there is one."""
+    """Choose among candidates that are probable enough, by an `exact` model where there is one."""
     probability = np.zeros(len(found.usable))
     probability[found.usable] = calibration.probability(found.evidence[found.usable])
     possible = found.usable & (probability >= config.reported)
-    ranked = np.argsort(-np.where(possible, probability, -1), kind="stable")[:_CONSIDERED]
-    rows = np.pad(ranked, (0, _CONSIDERED - len(ranked)), mode="edge")
-    usable = possible[rows] & (np.arange(_CONSIDERED) < len(ranked))
+    size = max(_FEWEST, compiled_size(possible.sum().item()))
+    ranked = np.argsort(-np.where(possible, probability, -1), kind="stable")[:size]
+    rows = np.pad(ranked, (0, size - len(ranked)), mode="edge")
+    usable = possible[rows] & (np.arange(size) < len(ranked))
     poses = found.T_camera_object[rows]
     score = probability.copy()
     if exact is not None:

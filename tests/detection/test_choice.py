@@ -185,6 +185,17 @@ def test_what_is_in_the_places_of_sure_poses_takes_no_room(monkeypatch: pytest.M
     assert stand(choice)[141] == 4.5
 
 
+def test_the_surest_copies_leave_room_for_all_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a full bin, hundreds of candidates lie at the copies that are seen best."""
+    sure = [(FAR * copy, 4.0) for copy in range(20) for _ in range(10)]
+    doubtful = [(-FAR * copy, 1.0) for copy in range(1, 31)]
+    found = candidates(*sure, *doubtful)
+    first, others = range(0, len(sure), 10), range(len(sure), len(sure) + len(doubtful))
+    turns, choice = refine(monkeypatch, found, {**{row: [4.0] for row in first}, **{row: [3.0] for row in others}})
+    assert turns == [[*first, *others]]
+    assert sorted(stand(choice)) == [*first, *others]
+
+
 def test_many_symmetries_are_compared_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     turns = [rotation_about(Z, angle) for angle in np.linspace(0, 2 * np.pi, 36, endpoint=False)]
     part = on_device(box_part(rotations=np.array(turns)))
