@@ -60,7 +60,7 @@ _COLUMNS = (  # of what is stored
     "due",  # whether detection, which is not always for later turns, comes to them, and chooses among them
     "reported",
 )
-_HOW = 9  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
+_HOW = 10  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
 _IN_MEMORY = 600  # searches, of each of which what was found first, crops and all, takes 10 MB
 _READING = Lock()  # NumPy parses the headers of arrays, which CPython 3.11 sometimes refuses two threads at once
 
