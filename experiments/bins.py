@@ -47,11 +47,11 @@ class TrueImage:
     visible: Float[np.ndarray, " i"]  # share of each copy that is seen
 
     def errors(self, poses: Float[np.ndarray, "s 4 4"]) -> Float[np.ndarray, "s i"]:
-        """Return the ADI of poses against each true one, in diameters; where it is above a half, perhaps a bound of it."""
+        """Return the ADI of poses against each true one, in diameters; above a half it may be a bound."""
         return self._of_near(poses, adi_of_pairs)
 
     def largest_errors(self, poses: Float[np.ndarray, "s 4 4"]) -> Float[np.ndarray, "s i"]:
-        """Return the MSSD of poses against each true one, in diameters; where it is above a half, perhaps a bound."""
+        """Return the MSSD of poses against each true one, in diameters; above a half it may be a bound."""
         turns = jnp.asarray(symmetry_transforms(self.part.symmetries))
         return self._of_near(poses, lambda pairs, points: mssd_of_pairs(pairs, points, turns))
 
