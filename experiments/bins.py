@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 
 from experiments.made_data import require_made
 from experiments.test_sets import SPLIT
@@ -93,7 +93,7 @@ class TrueImage:
         """Return errors of poses against each true one, in diameters; of pairs that are far apart lower bounds.
 
         The mean distance to the points of another one is at least that of one's own middle to the ball that they are
-        in, and no error is smaller than ADI.
+        in; the largest one is at least that of the middles, of which a symmetry moves none out of its ball.
         """
         points = self.part.points[:_POINTS]
         middle = points.mean(axis=0)
@@ -102,8 +102,7 @@ class TrueImage:
         errors = (np.linalg.norm(places[:, None] - copies[None], axis=2) - radius) / self.part.diameter
         near = errors <= _FAR
         rows, columns = np.nonzero(near)
-        pairs = np.tile(np.eye(4, dtype=np.float32), (compiled_size(len(rows)), 2, 1, 1))
-        pairs[: len(rows)] = np.stack([poses[rows], self.truth[columns]], axis=1)
+        pairs = padded(np.stack([poses[rows], self.truth[columns]], axis=1))
         errors[near] = np.asarray(errors_of(pairs, points))[: len(rows)] / self.part.diameter
         return errors
 
@@ -130,6 +129,15 @@ class WorldImage(TrueImage):
         if margin is not None:
             points = points[near_surface(points, self.part.points, self.truth, margin * self.part.diameter)]
         return Scan(points, None, None, None, self.scan.unit)
+
+
+def padded(pairs: Float[np.ndarray, "p 2 4 4"]) -> Float32[np.ndarray, "q 2 4 4"]:
+    """Return pairs of poses as seen from near to them, padded to a power of two."""
+    capacity = compiled_size(len(pairs))
+    origin = pairs[:, :1, :3, 3].copy()  # float32 of millimetres far from the camera would lose digits
+    near = pairs.copy()
+    near[:, :, :3, 3] -= origin
+    return np.concatenate([near, np.tile(np.eye(4), (capacity - len(pairs), 2, 1, 1))]).astype(np.float32)
 
 
 @jax.jit
