@@ -325,8 +325,8 @@ def _chosen_in_turns(
         sure = kept & (model.probability(found.evidence) >= _CONFIG.sure)
         if not sure.any():
             break
-        standing = (found.T_camera_object[of] for of in (kept & ~sure, sure))
-        more = (turns == turn) & in_unsure_places(found.T_camera_object, *standing, on_device)
+        poses = found.T_camera_object
+        more = (turns == turn) & in_unsure_places(poses, poses[kept & ~sure], poses[sure], on_device)
         if more.any():
             due |= more
             kept = kept_of(due)

@@ -24,7 +24,9 @@ DOCS = ("README.md", "docs/detect.md", "experiments/RESULTS.md")
 _RESULTS = ROOT / "experiments" / "results"
 _OURS = "kmn_jax"
 _OTHERS = "other scenes"
-_OTHERS_IN_SHORT = "[other scenes](docs/detect.md#outside-of-these-bins): tables, trays, thick rims, full bins, mixed parts, other sensors"
+_OTHERS_IN_SHORT = (
+    "[other scenes](docs/detect.md#outside-of-these-bins): tables, trays, full bins, mixed parts, other sensors"
+)
 _RELEASED = (
     "what is released: whole searches, for up to three objects that are not there, told as if for a quarter; after"
     " that, noisy images averaged, searches that go on among what is found, for poses of 0.1, the next best poses where"

@@ -79,8 +79,8 @@ def choose_and_refine(
     unsure, sure = _standing(best, config)
     while len(unsure) and len(sure) and len(tried) <= config.next_best:
         with clock("selection"):
-            poses = (best.candidates.T_camera_object[of] for of in (unsure, sure))
-            rows = next_best_rows(found, np.concatenate(tried), *poses, probabilities.found, on_device, config)
+            poses, before = best.candidates.T_camera_object, np.concatenate(tried)
+            rows = next_best_rows(found, before, poses[unsure], poses[sure], probabilities.found, on_device, config)
         if not len(rows):
             break
         best = judged(_together(best.candidates, refined(rows)))
