@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +32,7 @@ _POINTS = 1000  # of an object's surface, for errors
 _SHARED_POINTS = 500  # of it, to see which share lies on another
 THRESHOLD = 0.1  # of the diameter: a pose with less ADI is right
 _ALIKE = 0.03, 2 / 3  # diameters of a stranger, within which such a share of either surface lies on the other
+_FAR = 0.5  # diameters: no threshold of an error is higher
 LEAST_VISIBLE = 0.3  # share of a copy that is seen, from which on it ought to be found
 
 
@@ -46,16 +47,13 @@ class TrueImage:
     visible: Float[np.ndarray, " i"]  # share of each copy that is seen
 
     def errors(self, poses: Float[np.ndarray, "s 4 4"]) -> Float[np.ndarray, "s i"]:
-        """Return the ADI of poses against each true one, in diameters."""
-        points = jnp.asarray(self.part.points[:_POINTS])
-        found = np.asarray(adi_of_pairs(self._pairs(poses), points))
-        return found[: len(poses) * len(self.truth)].reshape(len(poses), len(self.truth)) / self.part.diameter
+        """Return the ADI of poses against each true one, in diameters; above a half it may be a bound."""
+        return self._of_near(poses, adi_of_pairs)
 
     def largest_errors(self, poses: Float[np.ndarray, "s 4 4"]) -> Float[np.ndarray, "s i"]:
-        """Return the MSSD of poses against each true one, in diameters."""
-        points, turns = jnp.asarray(self.part.points[:_POINTS]), symmetry_transforms(self.part.symmetries)
-        found = np.asarray(mssd_of_pairs(self._pairs(poses), points, jnp.asarray(turns)))
-        return found[: len(poses) * len(self.truth)].reshape(len(poses), len(self.truth)) / self.part.diameter
+        """Return the MSSD of poses against each true one, in diameters; above a half it may be a bound."""
+        turns = jnp.asarray(symmetry_transforms(self.part.symmetries))
+        return self._of_near(poses, lambda pairs, points: mssd_of_pairs(pairs, points, turns))
 
     def looks_like(self, other: Part, poses: Float[np.ndarray, "s 4 4"]) -> Bool[np.ndarray, " s"]:
         """Return at which poses another part hardly differs from a copy.
@@ -89,11 +87,24 @@ class TrueImage:
         turn, shift = symmetric_pose_error(*(np.asarray(value, dtype=np.float32) for value in given))
         return float(np.degrees(turn)), float(shift)
 
-    def _pairs(self, poses: Float[np.ndarray, "s 4 4"]) -> Float32[np.ndarray, "p 2 4 4"]:
-        """Return each pose with each true one, padded to a power of two."""
-        capacity = compiled_size(len(poses) * len(self.truth))
-        pairs = np.stack(np.broadcast_arrays(poses[:, None], self.truth[None]), axis=2).reshape(-1, 2, 4, 4)
-        return np.concatenate([pairs, np.tile(np.eye(4), (capacity - len(pairs), 2, 1, 1))]).astype(np.float32)
+    def _of_near(
+        self, poses: Float[np.ndarray, "s 4 4"], errors_of: Callable[[np.ndarray, np.ndarray], jax.Array]
+    ) -> Float[np.ndarray, "s i"]:
+        """Return errors of poses against each true one, in diameters; of pairs that are far apart lower bounds.
+
+        The mean distance to the points of another one is at least that of one's own middle to the ball that they are
+        in; the largest one is at least that of the middles, of which a symmetry moves none out of its ball.
+        """
+        points = self.part.points[:_POINTS]
+        middle = points.mean(axis=0)
+        radius = np.linalg.norm(points - middle, axis=1).max()
+        places, copies = (of[:, :3, :3] @ middle + of[:, :3, 3] for of in (poses, self.truth))
+        errors = (np.linalg.norm(places[:, None] - copies[None], axis=2) - radius) / self.part.diameter
+        near = errors <= _FAR
+        rows, columns = np.nonzero(near)
+        pairs = padded(np.stack([poses[rows], self.truth[columns]], axis=1))
+        errors[near] = np.asarray(errors_of(pairs, points))[: len(rows)] / self.part.diameter
+        return errors
 
 
 @dataclass(frozen=True)
@@ -118,6 +129,15 @@ class WorldImage(TrueImage):
         if margin is not None:
             points = points[near_surface(points, self.part.points, self.truth, margin * self.part.diameter)]
         return Scan(points, None, None, None, self.scan.unit)
+
+
+def padded(pairs: Float[np.ndarray, "p 2 4 4"]) -> Float32[np.ndarray, "q 2 4 4"]:
+    """Return pairs of poses as seen from near to them, padded to a power of two."""
+    capacity = compiled_size(len(pairs))
+    origin = pairs[:, :1, :3, 3].copy()  # float32 of millimetres far from the camera would lose digits
+    near = pairs.copy()
+    near[:, :, :3, 3] -= origin
+    return np.concatenate([near, np.tile(np.eye(4), (capacity - len(pairs), 2, 1, 1))]).astype(np.float32)
 
 
 @jax.jit

@@ -31,7 +31,7 @@ from kmn_jax.detection import (
     SearchConfig,
     chosen,
     explore,
-    in_doubtful_places,
+    in_unsure_places,
     next_best_rows,
     picture_evidence,
     refined_candidates,
@@ -60,7 +60,7 @@ _COLUMNS = (  # of what is stored
     "due",  # whether detection, which is not always for later turns, comes to them, and chooses among them
     "reported",
 )
-_HOW = 9  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
+_HOW = 10  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
 _IN_MEMORY = 600  # searches, of each of which what was found first, crops and all, takes 10 MB
 _READING = Lock()  # NumPy parses the headers of arrays, which CPython 3.11 sometimes refuses two threads at once
 
@@ -217,15 +217,15 @@ class _Kept:
 def _turns(
     found: Candidates, chooser: Calibration, on_device: DevicePart
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Return the rows of candidates to refine, and the turn in which detection would, if all places stayed doubtful.
+    """Return the rows of candidates to refine, and the turn in which detection would, if no place had a sure pose.
 
     Those that are just not probable enough for detection, of which there is one turn, are -1.
     """
     loose, first = (chosen(found, chooser, on_device, config) for config in (_LOOSE, _CONFIG))
     rows = [np.flatnonzero(first.kept | first.contenders)]
-    all_doubtful = found.T_camera_object, found.T_camera_object[:0]
+    all_unsure = found.T_camera_object[rows[0]], found.T_camera_object[:0]
     while len(rows[-1]) > 0 and len(rows) <= _CONFIG.next_best:
-        rows.append(next_best_rows(found, np.concatenate(rows), *all_doubtful, chooser, on_device, _CONFIG))
+        rows.append(next_best_rows(found, np.concatenate(rows), *all_unsure, chooser, on_device, _CONFIG))
     others = loose.kept | loose.contenders
     others[np.concatenate(rows)] = False
     rows.append(np.flatnonzero(others))
@@ -311,8 +311,8 @@ def _chosen_in_turns(
 ) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
     """Return which refined poses detection reports, and among which it chooses.
 
-    Later turns come where some pose is sure, but in its place a doubtful one stands. Which are sure is told before the
-    model is scaled, and poses do not vouch for each other; nor is known what would become of doubtful ones that are
+    Once some pose is sure, later turns come to places where one stands that is not. Which are sure is told before the
+    model is scaled, and poses do not vouch for each other; nor is known what would become of unsure ones that are
     refined once more.
     """
 
@@ -325,8 +325,8 @@ def _chosen_in_turns(
         sure = kept & (model.probability(found.evidence) >= _CONFIG.sure)
         if not sure.any():
             break
-        standing = (found.T_camera_object[of] for of in (kept & ~sure, sure))
-        more = (turns == turn) & in_doubtful_places(found.T_camera_object, *standing, on_device)
+        poses = found.T_camera_object
+        more = (turns == turn) & in_unsure_places(poses, poses[kept & ~sure], poses[sure], on_device)
         if more.any():
             due |= more
             kept = kept_of(due)

@@ -25,12 +25,12 @@ _RESULTS = ROOT / "experiments" / "results"
 _OURS = "kmn_jax"
 _OTHERS = "other scenes"
 _OTHERS_IN_SHORT = (
-    "[other scenes](docs/detect.md#outside-of-these-bins): tables, trays, thick rims, mixed parts, other sensors"
+    "[other scenes](docs/detect.md#outside-of-these-bins): tables, trays, full bins, mixed parts, other sensors"
 )
 _RELEASED = (
     "what is released: whole searches, for up to three objects that are not there, told as if for a quarter; after"
-    " that, noisy images averaged, and searches that go on among what is found, for poses of 0.1"
-    " ([results](results/worlds_test.json))"
+    " that, noisy images averaged, searches that go on among what is found, for poses of 0.1, the next best poses where"
+    " doubtful ones stand, and full bins ([results](results/worlds_test.json))"
 )
 _SEARCHES = {
     "fast: one draw": "fast",

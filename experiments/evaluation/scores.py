@@ -9,15 +9,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Shaped
+from jaxtyping import Bool, Float, Shaped
 
-from experiments.bins import adi_of_pairs, mssd_of_pairs
+from experiments.bins import adi_of_pairs, mssd_of_pairs, padded
 from experiments.evaluation.configs import noise_name
 from experiments.evaluation.predictions import Export, Predictions, Truth
 from kmn_jax.detection import symmetry_transforms
 from kmn_jax.objects import ObjectModel
 from kmn_jax.pose import average_recall, symmetric_pose_error
-from kmn_jax.programs import compiled_size
 
 THRESHOLD = 0.1  # of the object's size
 _POINTS = 1000  # of an object's surface, for errors
@@ -160,7 +159,7 @@ def _errors(poses: Float[np.ndarray, "c 4 4"], found: Predictions, truth: Truth,
 
 def _offsets(pairs: Float[np.ndarray, "p 2 4 4"], model: ObjectModel) -> Offsets:
     """Return by how much the first one of pairs of poses is off the second, true one."""
-    near, points = _padded(pairs), jnp.asarray(model.points[:_POINTS], dtype=jnp.float32)
+    near, points = padded(pairs), jnp.asarray(model.points[:_POINTS], dtype=jnp.float32)
     own = model.symmetries
     symmetries = [jnp.asarray(value, dtype=jnp.float32) for value in (own.rotations, own.axes, own.center)]
     turned, shifted = (np.asarray(value)[: len(pairs)] for value in _turned_and_shifted(near, *symmetries))
@@ -176,16 +175,7 @@ def _turned_and_shifted(pairs: jax.Array, *symmetries: jax.Array) -> tuple[jax.A
 def pair_errors(pairs: Float[np.ndarray, "p 2 4 4"], model: ObjectModel) -> Float[np.ndarray, " p"]:
     """Return the ADI of pairs of poses, the second one the true one, in diameters."""
     points = jnp.asarray(model.points[:_POINTS], dtype=jnp.float32)
-    return np.asarray(adi_of_pairs(_padded(pairs), points))[: len(pairs)] / model.diameter
-
-
-def _padded(pairs: Float[np.ndarray, "p 2 4 4"]) -> Float32[np.ndarray, "q 2 4 4"]:
-    """Return pairs of poses as seen from near to them, padded to a power of two."""
-    capacity = compiled_size(len(pairs))
-    origin = pairs[:, :1, :3, 3].copy()  # float32 of millimetres far from the camera would lose digits
-    near = pairs.copy()
-    near[:, :, :3, 3] -= origin
-    return np.concatenate([near, np.tile(np.eye(4), (capacity - len(pairs), 2, 1, 1))]).astype(np.float32)
+    return np.asarray(adi_of_pairs(padded(pairs), points))[: len(pairs)] / model.diameter
 
 
 def recall_rows(cells: Sequence[Cell], objects: str) -> list[dict[str, Any]]:

@@ -1,8 +1,8 @@
-"""Which candidates are refined, and which of them stand: the best of each place and, where that stays doubtful, others.
+"""Which candidates are refined, and which of them stand: the best of each place and, where that is not sure, others.
 
 What is said of a pose as it was found is rough: of several in one place, another one may become the better pose once
 all are refined. So, once some pose of the scene is sure, up to `DetectConfig.next_best` more of them are refined in
-each place of a doubtful one.
+each place where one stands that is not.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from kmn_jax.detection._timing import Clock
 from kmn_jax.detection._verification import VERIFIED, verified
 from kmn_jax.programs import compiled_size
 
-_FEWEST = 128  # poses that programs which compare them are compiled for
+_FEWEST, _MOST = 128, 2048  # poses that are compared with each other: powers of two, each of which is compiled for
 _POINTS = 16  # on the surface, by which candidates are told apart
 _OTHER = 0.05  # diameters: a candidate that is nowhere farther from one that was refined would become the same pose
 _APART = 2 * _OTHER  # centres of mass of such candidates, as sampled, are no farther apart
@@ -55,10 +55,10 @@ def choose_and_refine(
 ) -> Choice:
     """Return refined candidates, and the choice among them; what was found as it is where nothing of it is chosen.
 
-    Refined are the most probable one of each place and a contender; then, up to `config.next_best` times, the next one
-    of each place in which a doubtful pose stands, once one of the scene is sure: a part that is not there would only
-    have more chances to be mistaken, and of the many places where nothing stands few have one. In the end those that
-    stand and are not sure are refined once more, from where they are.
+    Refined are the most probable one of each place and a contender; then, once one of the scene is sure, up to
+    `config.next_best` times the next one of each place in which an unsure one stands, and in the end those that stand
+    and are unsure once more, from where they are. Without a sure one, a part that is not there would only have more
+    chances to be mistaken; and of the many places where nothing stands few have one.
     `search` is `config.search` of the network.
     """
     with clock("selection"):
@@ -76,57 +76,62 @@ def choose_and_refine(
 
     rows = np.flatnonzero(first.kept | first.contenders)
     best, tried = judged(refined(rows)), [rows]
-    for _ in range(config.next_best):
+    unsure, sure = _standing(best, config)
+    while len(unsure) and len(sure) and len(tried) <= config.next_best:
         with clock("selection"):
-            is_sure = best.selection.kept & (best.probability >= config.sure)
-            standing = (best.candidates.T_camera_object[of] for of in (best.selection.kept & ~is_sure, is_sure))
-            if not is_sure.any():
-                break
-            rows = next_best_rows(found, np.concatenate(tried), *standing, probabilities.found, on_device, config)
+            poses, before = best.candidates.T_camera_object, np.concatenate(tried)
+            rows = next_best_rows(found, before, poses[unsure], poses[sure], probabilities.found, on_device, config)
         if not len(rows):
             break
         best = judged(_together(best.candidates, refined(rows)))
         tried.append(rows)
-    doubtful = np.flatnonzero(best.selection.kept & (best.probability < config.sure))
-    if not len(doubtful):
+        unsure, sure = _standing(best, config)
+    if not len(unsure) or not len(sure):
         return best
     forms = len(best.candidates.usable) // sum(map(len, tried))
-    rows = np.concatenate([np.tile(some, forms) for some in tried])[doubtful]  # that they were made of
-    return judged(_together(best.candidates, refined(rows, best.candidates.T_camera_object[doubtful])))
+    rows = np.concatenate([np.tile(some, forms) for some in tried])[unsure]  # that they were made of
+    return judged(_together(best.candidates, refined(rows, best.candidates.T_camera_object[unsure])))
+
+
+def _standing(choice: Choice, config: DetectConfig) -> tuple[Int[np.ndarray, " u"], Int[np.ndarray, " t"]]:
+    """Return the rows of poses that stand and are not sure, and of those that are."""
+    is_sure = choice.probability >= config.sure
+    unsure, sure = (np.flatnonzero(choice.selection.kept & which) for which in (~is_sure, is_sure))
+    return unsure, sure
 
 
 def next_best_rows(
     found: Candidates,
     tried: Int[np.ndarray, " k"],
-    doubtful: Float32[np.ndarray, "d 4 4"],
+    unsure: Float32[np.ndarray, "u 4 4"],
     sure: Float32[np.ndarray, "t 4 4"],
     calibration: Calibration,
     part: DevicePart,
     config: DetectConfig,
 ) -> Int[np.ndarray, " b"]:
-    """Return the rows of the most probable candidate of each place that a `doubtful` pose is in, and no `sure` one.
+    """Return the rows of the most probable candidate of each place that an `unsure` pose is in, and no `sure` one.
 
     Candidates that are like those in the rows that were `tried` are left out.
     """
     rows = np.flatnonzero(found.usable)
-    rows = rows[in_doubtful_places(found.T_camera_object[rows], doubtful, sure, part)]
+    rows = rows[in_unsure_places(found.T_camera_object[rows], unsure, sure, part)]
     rows = rows[~_alike(found.T_camera_object[rows], found.T_camera_object[tried], part)]
     usable = np.zeros_like(found.usable)
     usable[rows] = True
     return np.flatnonzero(chosen(found._replace(usable=usable), calibration, part, config).kept)
 
 
-def in_doubtful_places(
+def in_unsure_places(
     poses: Float32[np.ndarray, "s 4 4"],
-    doubtful: Float32[np.ndarray, "d 4 4"],
+    unsure: Float32[np.ndarray, "u 4 4"],
     sure: Float32[np.ndarray, "t 4 4"],
     part: DevicePart,
 ) -> Bool[np.ndarray, " s"]:
-    """Return which poses have their middle as near to that of a doubtful one, and of no sure one, as one copy may."""
-    near_doubtful, near_sure = (
-        _apart(poses, others, part).min(axis=1, initial=np.inf) <= float(part.reach) for others in (doubtful, sure)
+    """Return which poses have their middle as near to an unsure one's as poses of one copy, and to no sure one's."""
+    near_unsure, near_sure = (
+        _apart(poses, others, part).min(axis=1, initial=np.inf) <= float(part.reach) for others in (unsure, sure)
     )
-    return near_doubtful & ~near_sure
+    return near_unsure & ~near_sure
 
 
 def _apart(
@@ -240,7 +245,7 @@ def chosen(
     probability = np.zeros(len(found.usable))
     probability[found.usable] = calibration.probability(found.evidence[found.usable])
     possible = found.usable & (probability >= config.reported)
-    size = max(_FEWEST, compiled_size(possible.sum().item()))
+    size = min(max(_FEWEST, compiled_size(possible.sum().item())), _MOST)
     ranked = np.argsort(-np.where(possible, probability, -1), kind="stable")[:size]
     rows = np.pad(ranked, (0, size - len(ranked)), mode="edge")
     usable = possible[rows] & (np.arange(size) < len(ranked))

@@ -25,9 +25,9 @@ class DetectConfig:
     promising: float = 0.1  # that from which on such a pose, in a new place, is a reason to go on, as likely ones are
     accepted: float = 0.8  # that from which on a pose counts as found: in world bins 95% of such poses are right
     reported: float = 0.1  # less probable poses are left out
-    # Poses of a place that are refined after the best one, as long as the one that stands there is not `sure`: of that
-    # probability, but another one of the scene is. Those that stand and are not sure are then refined once more. 0 and
-    # 0.0 leave it at the best ones: docs/detect.md says what that loses.
+    # Where another pose of the scene is `sure`, of that probability: how many poses of a place are refined after the
+    # best one, as long as the one that stands there is not. Those that stay so are then refined once more. 0 and 0.0
+    # leave it at the best ones.
     next_best: int = 4
     sure: float = 0.9
 

@@ -1,4 +1,4 @@
-"""Which candidates are refined: the best of each place, and others where that one stays doubtful."""
+"""Which candidates are refined: the best of each place, and others where that one is not sure."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_what_would_become_the_same_pose_or_is_hardly_probable_is_not_refined(mo
 def test_where_nothing_is_sure_no_others_are_refined(monkeypatch: pytest.MonkeyPatch) -> None:
     found = candidates((0.0, 3.0), (APART, 1.0), (FAR, 4.0))
     become = {0: [0.0, 0.1], 1: [0.0], 2: [2.0, 2.1]}
-    assert refine(monkeypatch, found, become)[0] == [[0, 2], [0, 2]]
+    assert refine(monkeypatch, found, become)[0] == [[0, 2]]
     become[2] = [2.5]
     assert refine(monkeypatch, found, become)[0] == [[0, 2], [1], [0]]
 
@@ -168,8 +168,8 @@ def test_what_looks_like_one_that_was_tried_is_not_refined(monkeypatch: pytest.M
     assert refine(monkeypatch, found, become, part=part)[0] == [[0, 2], [0]]
 
 
-def test_what_is_in_the_places_of_sure_poses_takes_no_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    """More candidates lie there than are ever compared, and all are more probable than the next best of one place."""
+def test_what_is_in_the_places_of_sure_poses_is_not_refined(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is more probable than the next best one of an unsure pose's place."""
     copies, others = 20, np.arange(1, 7) * 0.03 * BOX.diameter
     assert others.max() < same_place(BOX)
     rows = [
@@ -194,6 +194,19 @@ def test_the_surest_copies_leave_room_for_all_others(monkeypatch: pytest.MonkeyP
     turns, choice = refine(monkeypatch, found, {**{row: [4.0] for row in first}, **{row: [3.0] for row in others}})
     assert turns == [[*first, *others]]
     assert sorted(stand(choice)) == [*first, *others]
+
+
+def test_what_may_be_of_a_sure_poses_copy_is_in_no_unsure_place() -> None:
+    """Between two poses that stand, a third one may be of either's copy."""
+    half = 0.9 * same_place(BOX)
+    places = [pose((place * half, 0.0, 9.0), np.eye(3)) for place in (-2, -1, 0, 1)]
+    poses = np.stack(places).astype(np.float32)
+    assert choosing.in_unsure_places(poses, poses[1:2], poses[3:], on_device(BOX)).tolist() == [
+        True,
+        True,
+        False,
+        False,
+    ]
 
 
 def test_many_symmetries_are_compared_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 
 from experiments.bins import TrueImage, bin_images
+from kmn_jax.detection import symmetry_transforms
 from kmn_jax.errors import InputError
 from kmn_jax.models import load_pretrained
 from kmn_jax.objects import save_part
+from kmn_jax.pose import adi, mssd
 from tests.experiments.test_whole_bin import SMALL
 from tests.reference.clouds import box_cloud
+from tests.reference.meshes import random_rotations
 
 
 def box(size: tuple[float, float, float], random_seed: int, middle: tuple[float, float, float]) -> Any:
@@ -54,6 +57,32 @@ def test_a_part_looks_like_another_where_most_of_each_surface_lies_on_the_other(
     assert alike((100.0, 24.0, 16.0), 4, (30.0, 0, 0)) == [False, False]
     assert alike((40.0, 24.0, 16.0), 5, (0, 0, 300.0)) == [False, False]
     assert alike((40.0, 24.0, 16.0), 6) == []
+
+
+def test_errors_are_those_of_all_pairs_or_bounds_above_every_threshold() -> None:
+    """Poses lie about a diameter from a copy, some of them farther, half of them turned anyhow."""
+    image = next(bin_images(SMALL, "test", load_pretrained()))
+    rng, diameter = np.random.default_rng(0), image.part.diameter
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, :3, :3] = random_rotations(40, 0)
+    poses[::2, :3, :3] = image.truth[0, :3, :3]
+    poses[:, :3, 3] = image.truth[0, :3, 3] + rng.normal(size=(40, 3)) * diameter * rng.uniform(0, 1, (40, 1))
+    poses[:3] = image.truth[:3]
+    points, turns = image.part.points[:1000], symmetry_transforms(image.part.symmetries)
+    measures: list[tuple[Any, Any]] = [
+        (image.errors, lambda one, other: adi(one, other, points)),
+        (image.largest_errors, lambda one, other: mssd(one, other, points, turns)),
+    ]
+    for measure, wanted in measures:
+        found = measure(poses)
+        true = np.array([[wanted(one, other) for other in image.truth] for one in poses.astype(np.float32)]) / diameter
+        may_be_bounds = found > 0.5
+        np.testing.assert_allclose(found[~may_be_bounds], true[~may_be_bounds], atol=1e-5)
+        assert (true[may_be_bounds] >= found[may_be_bounds] - 1e-5).all()
+        assert (found < true - 0.1).any()
+        assert (found[3:] < 0.5).sum() > 5
+        assert (found < 0.1).any(axis=1)[:3].all()
+        assert measure(poses[:0]).shape == (0, len(image.truth))
 
 
 def test_cards_stand_for_the_meshes_of_a_dataset(tmp_path: Path) -> None:

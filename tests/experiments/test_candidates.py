@@ -220,9 +220,7 @@ def test_poses_are_chosen_among_as_those_of_a_search(motor: DevicePart) -> None:
     assert 0 < few.sum() < len(few)
 
 
-def test_of_later_turns_detection_sees_what_is_near_a_doubtful_pose(
-    motor: DevicePart, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_later_turns_detection_sees_what_is_near_an_unsure_pose(motor: DevicePart) -> None:
     """Where the first copy is sure, of the second one a pose of the second turn becomes so, before the third."""
     places, odds = [0.0, 0.02, 5.0, 5.02, 5.04, 0.04], [4.0, 5.0, 0.0, 4.0, 6.0, 7.0]
     turns, exact = np.array([0, 1, 0, 1, 2, -1]), Calibration(EVIDENCE, (1.0,) + (0.0,) * (len(EVIDENCE) - 1), 0.0)
