@@ -30,7 +30,7 @@ _OTHERS_IN_SHORT = (
 _RELEASED = (
     "what is released: whole searches, for up to three objects that are not there, told as if for a quarter; after"
     " that, noisy images averaged, searches that go on among what is found, for poses of 0.1, the next best poses where"
-    " doubtful ones stand, and full bins ([results](results/worlds_test.json))"
+    " unsure ones stand, and full bins ([results](results/worlds_test.json))"
 )
 _SEARCHES = {
     "fast: one draw": "fast",

@@ -201,12 +201,8 @@ def test_what_may_be_of_a_sure_poses_copy_is_in_no_unsure_place() -> None:
     half = 0.9 * same_place(BOX)
     places = [pose((place * half, 0.0, 9.0), np.eye(3)) for place in (-2, -1, 0, 1)]
     poses = np.stack(places).astype(np.float32)
-    assert choosing.in_unsure_places(poses, poses[1:2], poses[3:], on_device(BOX)).tolist() == [
-        True,
-        True,
-        False,
-        False,
-    ]
+    are_unsure = choosing.in_unsure_places(poses, poses[1:2], poses[3:], on_device(BOX))
+    assert are_unsure.tolist() == [True, True, False, False]
 
 
 def test_many_symmetries_are_compared_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
