@@ -185,9 +185,9 @@ def company(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2"]:
 class Probabilities:
     """The model of poses as they are found, which chooses among them, and that of refined ones, which is reported.
 
-    `refined` is the mean of models that are fitted to either error, scaled to say how probable it is that the points
-    are in their places on average. `exact` is of all of them being so: it tells poses of one place apart that are
-    turned against each other. `together` is of poses in one scene of which was said where parts are, by what
+    `exact` says how probable it is that all points of a refined pose are in their places: it tells poses of one place
+    apart that are turned against each other. `refined` says the same of the points on average, by the mean of a model
+    of that and of `exact`, scaled. `together` is of poses in one scene of which was said where parts are, by what
     `refined` says of each: if one is sure, doubtful ones are more often right. Anywhere else poses tell little about
     each other: there are walls, and other parts, to be mistaken.
     """
