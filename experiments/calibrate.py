@@ -13,9 +13,11 @@ round, by such a model that does not know the image's object, and what it refine
 fitted to. Of known worlds nothing is refined: `experiments.train_verifier` learns from what is found first, so that
 what the verifier says there is no evidence. Of refined poses detection reports one for each place: the one that a third
 model holds for the most probable, which is fitted to whether all points are in their places (MSSD), and not their mean
-(ADI). Models are too sure of themselves about kinds of objects that they were not fitted to: so the scales of the
-refined poses' models are fitted to what detection would report by models that do not know the kind. From the same
-poses, of scans of which is known where parts are, a fourth model learns what poses of one scene say about each other.
+(ADI). How probable it is that their mean is, is then said by both together: what lies on another part is seldom in
+place in all of its points. Models are too sure of themselves about kinds of objects that they were not fitted to: so
+the scales of the refined poses' models are fitted to what detection would report by models that do not know the kind.
+From the same poses, of scans of which is known where parts are, a fourth model learns what poses of one scene say about
+each other.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from typing import Annotated, Any
 import tyro
 
 from experiments.candidates import poses_to_fit
-from experiments.fits import FitOptions, by_largest_error, fit, fit_together
+from experiments.fits import FitOptions, by_largest_error, fit, fit_together, mean_of, predict
 from experiments.reliability_picture import save_reliability
 from experiments.searches import Sources
 from kmn_jax.detection import Probabilities, calibration_beside, load_lightgbm, probabilities_bytes
@@ -66,9 +68,12 @@ def calibrate(options: Options) -> dict[str, Any]:
     poses = poses_to_fit(options, options, network, options.candidates)
     refined = {column: values[poses["refined"]] for column, values in poses.items()}
     found = {column: values[~poses["refined"]] for column, values in poses.items()}
+    exact = by_largest_error(refined)
+    by_mean, by_largest = (predict(rows, options) for rows in (refined, exact))
     fitted = {
-        name: fit(rows, options)
-        for name, rows in (("found", found), ("refined", refined), ("exact", by_largest_error(refined)))
+        "found": fit(found, options, predict(found, options)),
+        "refined": fit(refined, options, mean_of(by_mean, by_largest)),
+        "exact": fit(exact, options, by_largest),
     }
     fitted["together"] = fit_together(refined, fitted["refined"].held_out, options)
     results = {name: one.results for name, one in fitted.items()}

@@ -16,6 +16,7 @@ from kmn_jax.detection import (
     EVIDENCE,
     Calibration,
     DetectConfig,
+    averaged,
     company,
     expected_calibration_error,
     fit_calibration,
@@ -94,27 +95,44 @@ def weights_of(poses: dict[str, np.ndarray], options: FitOptions) -> Float[np.nd
     return weights * (len(weights) / max(weights.sum(), 1e-9))
 
 
+class Predicted(NamedTuple):
+    """A model, and what models of its kind say of the objects that they were not fitted to."""
+
+    model: Calibration
+    held_out: Float[np.ndarray, " s"]  # log odds of the poses by models that do not know their object
+
+
 class Fitted(NamedTuple):
     """A model, and how well models predict the objects that they were not fitted to."""
 
     model: Calibration
-    held_out: Float[np.ndarray, " s"]  # log odds of the poses by models that do not know their object
+    held_out: Float[np.ndarray, " s"]  # log odds, see `Predicted`
     results: dict[str, Any]
 
 
-def fit(poses: dict[str, np.ndarray], options: FitOptions) -> Fitted:
-    """Fit a model of evidence.
+def predict(poses: dict[str, np.ndarray], options: FitOptions) -> Predicted:
+    """Fit a model of evidence, and those that do not know an object. Of all poses it must be `told` if they are right.
 
-    Of all poses it must be `told` whether they are right. Where some are those that detection reports, the scale of the
-    model is fitted to them, as models of other objects predict them, and they are what is judged, as if the share of
-    searches that is asked for was in vain.
+    Scales are as they come.
     """
-    right = poses["error"] < THRESHOLD
-    held_out = np.zeros(len(right))
+    held_out = np.zeros(len(poses["error"]))
     for names, others in held_out_models(poses, options):
         own = np.isin(poses["object"], names)
         held_out[own] = others.logit(poses["evidence"][own])
-    model = model_of(poses, options)
+    return Predicted(model_of(poses, options), held_out)
+
+
+def mean_of(*several: Predicted) -> Predicted:
+    """Return the mean of what models of the same poses say."""
+    return Predicted(averaged([one.model for one in several]), np.mean([one.held_out for one in several], axis=0))
+
+
+def fit(poses: dict[str, np.ndarray], options: FitOptions, predicted: Predicted) -> Fitted:
+    """Return what predicts poses, on the scale of what is right of those that detection reports, where some are these.
+
+    They are then also what is judged, as if the share of searches that is asked for was in vain.
+    """
+    right, (model, held_out) = poses["error"] < THRESHOLD, predicted
     if not poses["reported"].any():
         return Fitted(model, held_out, _judged(poses, held_out, np.ones(len(right))))
     judged, told_of = _reported(poses), held_out[poses["reported"]]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from itertools import chain
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -100,6 +101,17 @@ class Calibration:
         )
 
 
+def averaged(models: Sequence[Calibration]) -> Calibration:
+    """Return the model whose logits are the mean of those of models of the same evidence, with trees of one depth."""
+    parts = [model.scaled(1 / len(models), 0.0) for model in models]
+    return Calibration(
+        parts[0].names,
+        tuple(map(sum, zip(*(part.weights for part in parts), strict=True))),
+        sum(part.bias for part in parts),
+        *(tuple(chain.from_iterable(getattr(part, name) for part in parts)) for name in _TREE_FIELDS),
+    )
+
+
 def _logistic(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
     return 1 / (1 + np.exp(-np.clip(logits, -50, 50)))
 
@@ -173,8 +185,9 @@ def company(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2"]:
 class Probabilities:
     """The model of poses as they are found, which chooses among them, and that of refined ones, which is reported.
 
-    `exact` is of refined poses that are right in all of their points, not on average: it tells poses of one place apart
-    that are turned against each other. `together` is of poses in one scene of which was said where parts are, by what
+    `refined` is the mean of models that are fitted to either error, scaled to say how probable it is that the points
+    are in their places on average. `exact` is of all of them being so: it tells poses of one place apart that are
+    turned against each other. `together` is of poses in one scene of which was said where parts are, by what
     `refined` says of each: if one is sure, doubtful ones are more often right. Anywhere else poses tell little about
     each other: there are walls, and other parts, to be mistaken.
     """

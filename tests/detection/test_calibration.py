@@ -19,6 +19,7 @@ from kmn_jax.detection import (
     Calibration,
     CalibrationArrays,
     Probabilities,
+    averaged,
     chance_calibration_error,
     device_calibration,
     expected_calibration_error,
@@ -145,6 +146,17 @@ def test_a_scaled_model_says_the_same_in_other_odds() -> None:
     evidence, right = drawn(500)
     fitted = replace(fit_calibration(evidence, right, NAMES), weights=(0.5, 0.0, -1.0))
     np.testing.assert_allclose(fitted.scaled(0.8, 0.3).logit(evidence), 0.8 * fitted.logit(evidence) + 0.3, atol=1e-9)
+
+
+def test_the_mean_of_models_says_the_mean_of_their_odds() -> None:
+    evidence, right = drawn(500)
+    trees = [fit_calibration(evidence, outcome, NAMES) for outcome in (right, evidence[:, 1] > 3)]
+    lines = [fit_logistic(evidence, outcome, NAMES, ridge=1e-2) for outcome in (right, ~right)]
+    for models in (trees, lines, trees[:1]):
+        mean = np.mean([model.logit(evidence) for model in models], axis=0)
+        np.testing.assert_allclose(averaged(models).logit(evidence), mean, rtol=1e-9, atol=1e-9)
+    with pytest.raises(ValueError, match="zip"):
+        averaged([trees[0], lines[0]])
 
 
 def test_evidence_that_decides_completely_keeps_finite_weights() -> None:

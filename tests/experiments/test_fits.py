@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments import fits
-from experiments.fits import FitOptions, fit, fit_together
+from experiments.fits import FitOptions, Fitted, fit_together, mean_of, predict
 from kmn_jax.detection import expected_calibration_error, vouched
 from kmn_jax.errors import InputError
 
@@ -27,6 +27,11 @@ def drawn(random_seed: int, objects: int = _OBJECTS, spread: float = 1.0, oddity
         "refined": np.ones(right.size, dtype=bool),
         "reported": rng.random(right.size) < 0.9,
     }
+
+
+def fit(poses: dict[str, np.ndarray], options: FitOptions) -> Fitted:
+    """Return the model of one error, scaled."""
+    return fits.fit(poses, options, predict(poses, options))
 
 
 @pytest.fixture(autouse=True)
@@ -103,6 +108,28 @@ def test_poses_of_scenes_where_the_part_is_vouch_for_each_other() -> None:
         fit_together(rows | {"narrowed": np.zeros(right.size, dtype=bool)}, logits, FitOptions())
     with pytest.raises(InputError, match="less sure"):
         fit_together(rows, -logits, FitOptions())
+
+
+def test_what_is_told_of_refined_poses_is_the_mean_of_models_of_either_error_on_one_scale() -> None:
+    poses = drawn(0, spread=2.0)
+    # All points of every second right pose are in their places: what else is right is as odd as what is wrong.
+    right = poses["error"] < 0.1
+    exact = right & (np.arange(len(right)) % 2 == 0)
+    poses["largest_error"] = np.where(exact, 0.01, np.where(right, 0.4, poses["error"]))
+    options = FitOptions(members=1)
+    either = [predict(rows, options) for rows in (poses, fits.by_largest_error(poses))]
+    model, held_out, results = fits.fit(poses, options, mean_of(*either))
+    for logits, own in (
+        (model.logit(poses["evidence"]), [one.model.logit(poses["evidence"]) for one in either]),
+        (held_out, [one.held_out for one in either]),
+    ):
+        factor, offset = np.polyfit(np.mean(own, axis=0), logits, 1)
+        np.testing.assert_allclose(logits, factor * np.mean(own, axis=0) + offset, atol=1e-4)
+    assert factor > 0
+    reported = poses["reported"]
+    said = 1 / (1 + np.exp(-held_out[reported]))
+    assert said.mean() == pytest.approx(right[reported].mean(), rel=1e-3)  # and not the share that is exact
+    assert results["summary"]["right"] == pytest.approx(right[reported].mean())
 
 
 def test_absent_parts_count_more_among_refined_poses() -> None:
