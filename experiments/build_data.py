@@ -52,7 +52,7 @@ from experiments.test_sets import (
     verdict,
 )
 from experiments.training_parts import PARTS_SEED, TRAINING_FAMILIES
-from experiments.worlds import COMPOUND, TEST, TRAINING, VALIDATION, VERIFIER, Recipe, build_worlds
+from experiments.worlds import COMPOUND, TEST, TRAINING, VALIDATION, VARIOUS, VERIFIER, Recipe, build_worlds
 from kmn_jax.data import Pack, PackConfig, PackedObject, Record, Source, build_pack
 from kmn_jax.errors import InputError, check_whole
 from kmn_jax.files import make_folder
@@ -69,12 +69,13 @@ SMALL_PACK = (
     "Package_TO_SOT_SMD.3dshapes/TSOT-23",
 )
 SMALL_TEST_SET = ("Connector_USB.3dshapes/USB_A_TE_292303-7_Horizontal", "gear_motor")
-WorldSet = Literal["training", "verifier", "compound", "validation", "test"]
+WorldSet = Literal["training", "verifier", "compound", "validation", "various", "test"]
 WORLDS: dict[WorldSet, Recipe] = {
     "training": TRAINING,
     "verifier": VERIFIER,
     "compound": COMPOUND,
     "validation": VALIDATION,
+    "various": VARIOUS,
     "test": TEST,
 }
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from experiments.solids import Solid, bent_tube, box, circle, moved, pierced, prism, rectangle, revolved, union
 from experiments.training_parts import COMPOUNDS, TRAINING_FAMILIES
+from experiments.various_parts import VARIOUS_FAMILIES
 from kmn_jax.files import write_whole
 
 
@@ -145,7 +146,7 @@ FAMILIES: Mapping[str, Callable[[np.random.Generator], Solid]] = {
         washer, stepped_shaft, angle_bracket, perforated_plate, flanged_tube, lever,
         hex_nut, hex_bolt, bent_sheet, elbow, mug, flange_motor,
     )
-} | dict(TRAINING_FAMILIES) | dict(COMPOUNDS)  # fmt: skip
+} | dict(TRAINING_FAMILIES) | dict(COMPOUNDS) | dict(VARIOUS_FAMILIES)  # fmt: skip
 VALIDATION_FAMILIES = ("washer", "stepped_shaft", "angle_bracket", "perforated_plate", "flanged_tube", "lever")
 TEST_FAMILIES = ("hex_nut", "hex_bolt", "bent_sheet", "elbow", "mug", "flange_motor")
 

@@ -38,7 +38,7 @@ class Sources:
 
     method: Literal["kmn_jax", "FPFH"] = "kmn_jax"
     bins: Path = Path("outputs/validation_bins")  # folder with datasets in BOP format
-    worlds: Path | None = None  # folder of world bins to fit on, too: outputs/worlds/validation
+    worlds: tuple[Path, ...] = ()  # folders of world bins to fit on, too: outputs/worlds/validation
     known_worlds: tuple[Path, ...] = ()  # the same, of families of parts that the network, or the verifier, knows
     every: int = 1  # use every so many images of `bins`
     judge_anew: bool = False  # compute what depth images show of stored poses again, as after a change of that code
@@ -165,8 +165,7 @@ def _asked(image: TrueImage, row: int, is_known: bool) -> Iterator[tuple[Part, F
 
 
 def _images(sources: Sources, network: Model) -> Iterator[_Image]:
-    worlds = [(False, sources.worlds)] if sources.worlds else []
-    worlds += [(True, known) for known in sources.known_worlds]
+    worlds = [(False, world) for world in sources.worlds] + [(True, known) for known in sources.known_worlds]
     named = [_name(world) for _, world in worlds]
     if len(set(named)) < len(named):
         raise InputError(f"worlds are told apart by their folders' names, but these are {', '.join(named)}: rename one")

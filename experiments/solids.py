@@ -79,6 +79,29 @@ def bent_tube(bend: float, outer: float, inner: float, angle: float, straight: f
     return vertices, triangles[:, ::-1]
 
 
+def arc(radius: float, broad: float, thick: float, begin: float, end: float) -> Solid:
+    """Return a piece of a flat ring, of which the middle of its breadth has the radius, from one angle to another."""
+    inner, outer = radius - broad / 2, radius + broad / 2
+    section = np.array([[inner, 0], [outer, 0], [outer, thick], [inner, thick]])
+    turns = np.linspace(begin, end, _AROUND // 2)
+    sides = [np.column_stack([np.outer(section[:, 0], [np.cos(turn), np.sin(turn)]), section[:, 1]]) for turn in turns]
+    return swept(np.stack(sides))
+
+
+def swept(sections: Float[np.ndarray, "n k 3"]) -> Solid:
+    """Return what flat outlines span, each with the one after it; the first and the last are closed from their middles.
+
+    They are counterclockwise as one sees them who looks back from where they lead.
+    """
+    first, last = (np.broadcast_to(sections[row].mean(axis=0), sections[:1].shape) for row in (0, -1))
+    return _around(np.concatenate([first, sections, last]))
+
+
+def torus(radius: float, around: float) -> Solid:
+    """Return a ring: what a circle of the radius `around` sweeps, whose middle goes around the z axis."""
+    return revolved(circle(around)[::4] + np.array([radius, 0.0]))
+
+
 def moved(solid: Solid, offset: Sequence[float], turn: float = 0.0, axis: int = 2) -> Solid:
     """Return a solid turned about an axis of its frame, then moved."""
     rotation = np.eye(3)

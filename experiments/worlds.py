@@ -23,6 +23,7 @@ import numpy as np
 from experiments.parametric_parts import TEST_FAMILIES, VALIDATION_FAMILIES, write_parts
 from experiments.test_sets import SPLIT, claim, metric_model, write_scenes
 from experiments.training_parts import COMPOUNDS, PARTS_SEED, TRAINING_FAMILIES
+from experiments.various_parts import VARIOUS_FAMILIES
 from kmn_jax.bop import (
     BopFrame,
     dataset_digest,
@@ -123,6 +124,8 @@ VERIFIER = Recipe(14, tuple(TRAINING_FAMILIES), 1.0, parts_a_family=4, sensors=T
 # Of two of these families each, as the verifier wants many kinds of parts, and such as have a piece in common.
 COMPOUND = Recipe(15, tuple(COMPOUNDS), 1.0, parts_a_family=1, sensors=TRAINING.sensors)
 VALIDATION = Recipe(11, VALIDATION_FAMILIES, 1.0, parts_a_family=4, images=16)
+# Of twice as many families, for the fit alone: what holds of six kinds of parts need not hold of others.
+VARIOUS = Recipe(16, tuple(VARIOUS_FAMILIES), 1.0, images=8)
 TEST = Recipe(12, TEST_FAMILIES, 1.15)
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from experiments.parametric_parts import FAMILIES, TEST_FAMILIES, VALIDATION_FAMILIES, write_parts
 from experiments.training_parts import COMPOUNDS, TRAINING_FAMILIES, larger_piece
+from experiments.various_parts import VARIOUS_FAMILIES
 from kmn_jax.objects import load_object
 from kmn_jax.simulate import collision_shape
 
@@ -38,7 +39,7 @@ def test_bores_go_through(family: str) -> None:
 
 
 def test_no_family_is_in_two_sets() -> None:
-    names = [*VALIDATION_FAMILIES, *TEST_FAMILIES, *TRAINING_FAMILIES, *COMPOUNDS]
+    names = [*VALIDATION_FAMILIES, *VARIOUS_FAMILIES, *TEST_FAMILIES, *TRAINING_FAMILIES, *COMPOUNDS]
     assert len(set(names)) == len(names)
     assert set(names) == set(FAMILIES)
 

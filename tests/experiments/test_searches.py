@@ -127,21 +127,28 @@ def test_known_worlds_come_last_and_share_the_numbers_of_their_families(
     (tmp_path / "bins" / "a" / module.SPLIT).mkdir(parents=True)
     image = SimpleNamespace(key=FrameKey(5, 0), scene=None)
     monkeypatch.setattr(module, "bin_images", lambda *given: [image])
-    images = {"validation": ["mug", "nut"], "b": ["cup", "clip"], "a": ["clip_with_cup", "cup_with_clip", "hook"]}
+    images = {
+        "validation": ["mug", "nut"],
+        "various": ["nut", "hook"],
+        "b": ["cup", "clip"],
+        "a": ["clip_with_cup", "cup_with_clip", "bail"],
+    }
     monkeypatch.setattr(
         module, "world_images", lambda folder, network: [world(kind=kind) for kind in images[folder.name]]
     )
-    folders = tmp_path / "worlds" / "validation", tmp_path / "worlds" / "b", tmp_path / "worlds" / "a"
-    sources, nothing = Sources(bins=tmp_path / "bins", worlds=folders[0], known_worlds=folders[1:]), cast(Any, None)
-    numbers = {"b": (2, 3), "a": (3, 2, 4)}  # compounds count as their larger piece
+    folders = [tmp_path / "worlds" / name for name in images]
+    sources = Sources(bins=tmp_path / "bins", worlds=tuple(folders[:2]), known_worlds=tuple(folders[2:]))
+    nothing = cast(Any, None)
+    numbers = {"b": (3, 4), "a": (4, 3, 5)}  # compounds count as their larger piece
     found = [(one.folder, one.row, one.number, one.is_known) for one in module._images(sources, nothing)]
     assert found == [
         ("bins-a", 0, 1005, False),
         *(("worlds-validation", row, row, False) for row in range(2)),
+        *(("worlds-various", row, row + 1, False) for row in range(2)),
         *((f"worlds-{name}", row, number, True) for name in "ba" for row, number in enumerate(numbers[name])),
     ]
-    twice = replace(sources, known_worlds=(tmp_path / "worlds" / "validation",))
-    with pytest.raises(InputError, match="these are worlds-validation, worlds-validation: rename one"):
+    twice = replace(sources, known_worlds=(folders[0],))
+    with pytest.raises(InputError, match="are worlds-validation, worlds-various, worlds-validation: rename one"):
         next(module._images(twice, nothing))
 
 
