@@ -21,8 +21,8 @@ from kmn_jax.detection import (
     expected_calibration_error,
     fit_calibration,
     fit_logistic,
+    in_company,
     keeps_order,
-    vouched,
 )
 from kmn_jax.errors import InputError, require
 
@@ -145,36 +145,28 @@ def fit(poses: dict[str, np.ndarray], options: FitOptions, predicted: Predicted)
 
 
 def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: FitOptions) -> Fitted:
-    """Fit the model of what reported poses of one narrowed search say about each other, given the log odds of each.
+    """Fit the model of what reported poses of one search say about each other, given the log odds of each.
 
-    What is judged are all reported poses, of which those of other searches, and those that are alone, keep their odds.
-    Raises InputError if no two poses are reported of one such search, or the less sure ones are right.
+    Raises InputError if the less sure ones are right.
     """
     logits, poses = logits[poses["reported"]], _reported(poses)
-    right, together = poses["error"] < THRESHOLD, poses["narrowed"].copy()
-    rows_of = [np.flatnonzero(poses["search"] == search) for search in np.unique(poses["search"])]
+    right, narrowed, counts = poses["error"] < THRESHOLD, poses["narrowed"], _as_asked(poses, options)
     columns = np.zeros((len(logits), len(COMPANY)))
-    for rows in rows_of:
+    for search in np.unique(poses["search"]):
+        rows = poses["search"] == search
         columns[rows] = company(logits[rows])
-        together[rows] &= len(rows) > 1
-    if not together.any():
-        raise InputError("in no image of the bins are two poses reported: give more bins")
 
     def of_company(rows: Bool[np.ndarray, " s"]) -> Calibration:
-        model = fit_logistic(columns[rows], right[rows], COMPANY, _SCALE_RIDGE)
+        model = fit_logistic(columns[rows], right[rows], COMPANY, _SCALE_RIDGE, weights=counts[rows])
         if not keeps_order(model):
             raise InputError("of poses of one image those are right that are less sure: give more bins")
         return model
 
-    held_out = logits.copy()
+    held_out = np.zeros(len(logits))
     for names in _folds(poses, options):
-        own = together & np.isin(poses["object"], names)
-        if own.any():
-            others = of_company(together & ~own)
-            for rows in rows_of:
-                if own[rows].any():
-                    held_out[rows] = vouched(logits[rows], others)
-    return Fitted(of_company(together), held_out, _judged(poses, held_out, _as_asked(poses, options)))
+        own = np.isin(poses["object"], names)
+        held_out[own] = in_company(columns[own], of_company(~own), narrowed[own])
+    return Fitted(of_company(np.ones(len(right), dtype=bool)), held_out, _judged(poses, held_out, counts))
 
 
 def _reported(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

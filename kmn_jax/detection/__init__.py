@@ -12,11 +12,11 @@ from kmn_jax.detection._calibration import (
     chance_calibration_error,
     company,
     expected_calibration_error,
+    in_company,
     keeps_order,
     load_probabilities,
     probabilities_bytes,
     reliability,
-    vouched,
 )
 from kmn_jax.detection._canonical import canonical_pose
 from kmn_jax.detection._choice import (
@@ -174,6 +174,7 @@ __all__ = [
     "foreground",
     "gather_evidence",
     "grasp_conflict",
+    "in_company",
     "in_front_of_empty",
     "in_unsure_places",
     "inside_bin",
@@ -222,7 +223,6 @@ __all__ = [
     "table",
     "verified",
     "verifier_cells",
-    "vouched",
     "warnings_once",
     "with_grasps",
     "write_bop_csv",

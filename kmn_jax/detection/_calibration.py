@@ -173,12 +173,13 @@ def _by_range(
     return rows
 
 
-COMPANY = ("own", "best")  # the evidence of `together`, see `company`
+_SURE = 4.0  # log odds of a pose that leaves no doubt that its part is there
+COMPANY = ("own", f"best, at most {_SURE:g}")  # the evidence of `together`, see `company`
 
 
 def company(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2"]:
-    """Return of each pose of one scene its log odds, and those of the most probable pose there."""
-    return np.stack([logits, np.full_like(logits, logits.max(initial=-np.inf))], axis=1)
+    """Return of each pose of one scene its log odds, and those of the most probable pose there, if it is not sure."""
+    return np.stack([logits, np.full_like(logits, min(logits.max(initial=-np.inf), _SURE))], axis=1)
 
 
 @dataclass(frozen=True)
@@ -187,9 +188,8 @@ class Probabilities:
 
     `refined` is the mean of models that are fitted to either error, scaled to say how probable it is that the points
     are in their places on average. `exact` is of all of them being so: it tells poses of one place apart that are
-    turned against each other. `together` is of poses in one scene of which was said where parts are, by what
-    `refined` says of each: if one is sure, doubtful ones are more often right. Anywhere else poses tell little about
-    each other: there are walls, and other parts, to be mistaken.
+    turned against each other. `together` is of poses in one scene, by what `refined` says of each: where none is sure,
+    the part may not be there at all, and where one is, it is, see `in_company`.
     """
 
     found: Calibration
@@ -199,21 +199,22 @@ class Probabilities:
 
     def of_scene(self, evidence: Float[np.ndarray, "s f"], is_narrowed: bool) -> Float[np.ndarray, " s"]:
         """Return the probabilities of all refined poses that stand in one scene."""
-        logits = self.refined.logit(evidence)
-        return _logistic(vouched(logits, self.together) if is_narrowed else logits)
+        return _logistic(in_company(company(self.refined.logit(evidence)), self.together, is_narrowed))
 
 
-def vouched(logits: Float[np.ndarray, " s"], together: Calibration) -> Float[np.ndarray, " s"]:
-    """Return the log odds of poses that vouch for each other: none has less than alone, and their order stays.
+def in_company(
+    columns: Float[np.ndarray, "s 2"], together: Calibration, is_narrowed: bool | Bool[np.ndarray, " s"]
+) -> Float[np.ndarray, " s"]:
+    """Return the log odds of poses, given their `company`, in scenes of which was said where parts are, or not.
 
-    That doubtful poses speak against each other is left out: so they do in full bins, which are what is fitted to, but
-    not where the last copy lies.
+    Where it was not, there are walls, and other parts, to be mistaken: no pose there is more probable for a sure one.
     """
-    return np.maximum(logits, together.logit(company(logits))) if len(logits) > 1 else logits
+    told = together.logit(columns)
+    return np.where(is_narrowed, told, np.minimum(columns[:, 0], told))
 
 
 def keeps_order(together: Calibration) -> bool:
-    """Tell whether of two poses of one scene that have company the surer one stays the more probable one."""
+    """Tell whether of two poses of one scene the surer one stays the more probable one."""
     return len(together.weights) > 0 and together.weights[0] > 0 and not together.values
 
 

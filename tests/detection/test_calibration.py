@@ -192,22 +192,25 @@ def test_several_members_are_the_mean_of_their_models() -> None:
     assert np.abs(three.logit(evidence) - one.logit(evidence)).max() > 0.01
 
 
-def test_sure_poses_vouch_for_others_of_their_scene() -> None:
+def test_poses_are_doubted_where_none_is_sure_and_vouched_for_where_parts_are_said_to_be() -> None:
     own = Calibration(("x",), (1.0,), 0.0)
-    models = Probabilities(own, own, own, Calibration(COMPANY, (1.1, 1.15), -4.8))
+    models = Probabilities(own, own, own, Calibration(COMPANY, (0.8, 1.4), -4.4))
     rng = np.random.default_rng(0)
-    assert len(models.of_scene(np.zeros((0, 1)), True)) == 0
+    for is_narrowed in (False, True):
+        assert len(models.of_scene(np.zeros((0, 1)), is_narrowed)) == 0
     for count in (1, 2, 3, 12):
         evidence = 3 * rng.normal(size=(count, 1))
         alone = own.probability(evidence)
-        np.testing.assert_allclose(models.of_scene(evidence, False), alone, rtol=1e-12)
-        together = models.of_scene(evidence, True)
-        assert (together >= alone).all()
-        assert (np.diff(together[np.argsort(alone, kind="stable")]) >= 0).all()  # the order stays
-    np.testing.assert_allclose(models.of_scene(np.array([[1.2]]), True), own.probability(np.array([[1.2]])), rtol=1e-12)
-    doubtful, with_a_sure_one = np.array([[-1.0], [-2.0]]), np.array([[-1.0], [6.0]])
-    np.testing.assert_allclose(models.of_scene(doubtful, True), own.probability(doubtful), rtol=1e-12)
-    assert models.of_scene(with_a_sure_one, True)[0] > 2 * own.probability(doubtful)[0]
+        wide, narrowed = (models.of_scene(evidence, is_narrowed) for is_narrowed in (False, True))
+        np.testing.assert_allclose(wide, np.minimum(alone, narrowed), rtol=1e-12)
+        for together in (wide, narrowed):
+            assert (np.diff(together[np.argsort(alone, kind="stable")]) >= 0).all()  # the order stays
+    doubtful, with_a_sure_one, with_a_surer_one = (np.array([[1.5], [x]]) for x in (1.0, 4.0, 9.0))
+    for is_narrowed in (False, True):
+        assert models.of_scene(doubtful, is_narrowed)[0] < 0.5 * own.probability(doubtful)[0]
+        sure, surer = (models.of_scene(some, is_narrowed)[0] for some in (with_a_sure_one, with_a_surer_one))
+        assert sure == surer
+        assert (sure > own.probability(doubtful)[0]) == is_narrowed
 
 
 def test_reliability_counts_every_pose_once() -> None:

@@ -40,8 +40,9 @@ def by(column: int) -> Calibration:
     return Calibration(EVIDENCE, tuple(float(row == column) for row in range(len(EVIDENCE))), 0.0)
 
 
-# The first column of evidence is the log odds of a pose as it was found, the second those of a refined one.
-MODELS = Probabilities(by(0), by(1), by(1), Calibration(COMPANY, (1.0, 0.0), -9.0))
+# The first column of evidence is the log odds of a pose as it was found, the second those of a refined one, of which
+# none tells anything of another.
+MODELS = Probabilities(by(0), by(1), by(1), Calibration(COMPANY, (1.0, 0.0), 0.0))
 
 
 def candidates(*rows: tuple[float, float]) -> Candidates:
