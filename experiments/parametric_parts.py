@@ -1,8 +1,8 @@
 """CAD parts made by parameters: sheets, rings, nuts, bolts, brackets, hollow parts, for the world bins.
 
-Lengths are in millimetres, longest extents from 20 to 120. Validation, test and training (`experiments.training_parts`,
-with compounds of it) share no family, but each has thin, flat, round, hollow and many-sided parts, so that what is
-chosen on one is asked for by the other.
+Lengths are in millimetres, longest extents from 20 to 120. Validation, `experiments.various_parts`, test and training
+(`experiments.training_parts`, with compounds of it) share no family, but each has thin, flat, round, hollow and
+many-sided parts, so that what is chosen on one is asked for by the other.
 """
 
 from __future__ import annotations

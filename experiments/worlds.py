@@ -1,11 +1,11 @@
 """World bins: scenes of many kinds under physics, to fit probabilities on and to test on, as BOP datasets.
 
 Training (of parts that the network was trained with), verifier (of the same families of parts, but others of each),
-compound (of parts that are grown together of two of them), validation and test differ in random seeds and in the
-families of parts (`experiments.parametric_parts`), the test also in the ranges of containers. Each family of worlds is
-one scene of the dataset, `worlds.json` names them; of each scene's images some show no copy of the part that is asked
-for, but other parts or nothing. `test_targets_bop19.json` says which part is asked for in which image, with the number
-of its copies; other parts have no entries in scene_gt.json.
+compound (of parts that are grown together of two of them), validation, various and test differ in random seeds and in
+the families of parts (`experiments.parametric_parts`), the test also in the ranges of containers. Each family of worlds
+is one scene of the dataset, `worlds.json` names them; of each scene's images some show no copy of the part that is
+asked for, but other parts or nothing. `test_targets_bop19.json` says which part is asked for in which image, with the
+number of its copies; other parts have no entries in scene_gt.json.
 """
 
 from __future__ import annotations
