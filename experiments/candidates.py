@@ -29,6 +29,7 @@ from kmn_jax.detection import (
     DetectConfig,
     DevicePart,
     SearchConfig,
+    averaged,
     chosen,
     explore,
     in_unsure_places,
@@ -61,6 +62,7 @@ _COLUMNS = (  # of what is stored
     "reported",
 )
 _HOW = 10  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
+_CHOSEN = 1  # version of how what is reported is chosen among what was collected: with it stored searches stay
 _IN_MEMORY = 600  # searches, of each of which what was found first, crops and all, takes 10 MB
 _READING = Lock()  # NumPy parses the headers of arrays, which CPython 3.11 sometimes refuses two threads at once
 
@@ -294,14 +296,14 @@ def _with_reported(poses: Columns, searched: dict[int, DevicePart], fits: FitOpt
     """Return poses with what detection refines and reports, by models that do not know the image's object."""
     none = np.zeros(len(poses["error"]), dtype=bool)  # it is not known yet, or that of other evidence
     fine = {name: values[poses["refined"]] for name, values in (poses | {"reported": none}).items()}
-    others, exact = (_models(rows, fits) for rows in (fine, by_largest_error(fine)))
+    of_mean, exact = (_models(rows, fits) for rows in (fine, by_largest_error(fine)))
+    models = {number: (averaged([of_mean[number], exact[number]]), exact[number]) for number in exact}
     due, reported = none.copy(), none.copy()
     for row, on_device in searched.items():
         rows = np.flatnonzero((poses["search"] == row) & (poses["turn"] >= 0))
         if len(rows):
-            number = int(poses["object"][rows[0]])
             found = _choosable(poses["T_camera_object"][rows], poses["evidence"][rows])
-            kept, among = _chosen_in_turns(found, poses["turn"][rows], others[number], exact[number], on_device)
+            kept, among = _chosen_in_turns(found, poses["turn"][rows], *models[int(poses["object"][rows[0]])], on_device)
             due[rows], reported[rows] = among, kept
     return poses | {"due": due, "reported": reported}
 
@@ -380,8 +382,8 @@ def _explored(
 
 def _made_of(sources: Sources, fits: FitOptions, network: Model) -> str:
     """Say what candidates are made of."""
-    folders = [str(folder) for folder in (sources.bins, sources.worlds, *sources.known_worlds)]
-    return repr((_HOW, SEARCHED, sources.method, folders, sources.every, *_settings(fits, network)))
+    folders = str(sources.bins), *(tuple(map(str, worlds)) for worlds in (sources.worlds, sources.known_worlds))
+    return repr((_HOW, _CHOSEN, SEARCHED, sources.method, folders, sources.every, *_settings(fits, network)))
 
 
 def _settings(fits: FitOptions, network: Model) -> tuple[Any, ...]:

@@ -38,8 +38,8 @@ from tests.reference.networks import TINY
 def searched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let two searches be made again, whose pictures tell search, pose and kind of evidence apart.
 
-    Models are named by how many poses they take for right: what chooses is to be the one of ADI, and the exact one that
-    of MSSD.
+    Models are named by how many poses they take for right: what chooses is to be the mean of those of ADI and of MSSD,
+    and the exact one that of MSSD.
     """
 
     def searches(sources: Sources, network: Any) -> Any:
@@ -61,8 +61,8 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
         assert poses["refined"].all()
         return [(np.unique(poses["object"]), int((poses["error"] < 0.1).sum()))]
 
-    def all_but_the_first(found: Candidates, model: int, part: Any, config: Any, exact: int) -> Any:
-        assert (model, exact) == (5, 2)
+    def all_but_the_first(found: Candidates, model: tuple[int, int], part: Any, config: Any, exact: int) -> Any:
+        assert (model, exact) == ((5, 2), 2)
         assert found.evidence.shape[1] == len(EVIDENCE)
         return SimpleNamespace(kept=np.arange(len(found.usable)) > 0)
 
@@ -70,6 +70,7 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "picture_evidence", shown)
     monkeypatch.setattr(module, "verified", shown_to_verifier)
     monkeypatch.setattr(module, "held_out_models", models)
+    monkeypatch.setattr(module, "averaged", tuple)
     monkeypatch.setattr(module, "chosen", all_but_the_first)
 
 
