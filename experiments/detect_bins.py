@@ -184,17 +184,9 @@ def run(options: Options) -> dict[str, Any]:
     unknown = [name for name in options.methods if name not in METHODS]
     if unknown:
         raise InputError(f"method {unknown[0]!r} is not known: choose among {', '.join(METHODS)}")
-    if "FPFH" in options.methods and options.fpfh_calibration == FPFH_CALIBRATION and not FPFH_CALIBRATION.exists():
-        raise InputError(
-            f"{FPFH_CALIBRATION} has not been made yet: python -m experiments.calibrate --method FPFH --output"
-            f" {FPFH_CALIBRATION}, or leave FPFH out by --methods kmn_jax"
-        )
+    fitted = {name: _fitted(name, options) for name in options.methods}
     require_made(*options.sets)
     model = load_pretrained() if options.model is None else load_model(options.model)
-    fitted: dict[str, Probabilities] = {
-        name: load_probabilities(options.fpfh_calibration if name == "FPFH" else options.calibration, EVIDENCE)
-        for name in options.methods
-    }
     tallies: dict[tuple[str, str], Tally] = defaultdict(Tally)
     for folder in options.sets:
         for image in tqdm(bin_images(folder, SPLIT, model, options.every), unit="image", desc=folder.name):
@@ -218,6 +210,20 @@ def run(options: Options) -> dict[str, Any]:
     write_json(options.json, results)
     save_reliability(curves, options.picture)
     return results
+
+
+def _fitted(name: str, options: Options) -> Probabilities:
+    """Return the probabilities of a method. Raises InputError, which for FPFH says how they are made."""
+    if name != "FPFH":
+        return load_probabilities(options.calibration, EVIDENCE)
+    path = options.fpfh_calibration
+    made_by = f"python -m experiments.calibrate --method FPFH --output {path}, or leave FPFH out by --methods kmn_jax"
+    if not path.exists():
+        raise InputError(f"{path} has not been made yet: {made_by}")
+    try:
+        return load_probabilities(path, EVIDENCE)
+    except InputError as problem:
+        raise InputError(f"{problem}: {made_by}") from None
 
 
 def _found(name: str, model: Model, fitted: Probabilities, image: BinImage) -> Detections:

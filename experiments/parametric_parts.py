@@ -140,7 +140,7 @@ def flange_motor(rng: np.random.Generator) -> Solid:
     )
 
 
-FAMILIES: Mapping[str, Callable[[np.random.Generator], Solid]] = {
+FAMILIES: Mapping[str, Callable[[np.random.Generator], Solid]] = {  # places are seeds: new ones come last
     build.__name__: build
     for build in (
         washer, stepped_shaft, angle_bracket, perforated_plate, flanged_tube, lever,

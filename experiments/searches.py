@@ -38,7 +38,7 @@ class Sources:
 
     method: Literal["kmn_jax", "FPFH"] = "kmn_jax"
     bins: Path = Path("outputs/validation_bins")  # folder with datasets in BOP format
-    worlds: tuple[Path, ...] = ()  # folders of world bins to fit on, too: outputs/worlds/validation
+    worlds: tuple[Path, ...] = ()  # folders of world bins to fit on, too: outputs/worlds/validation and various
     known_worlds: tuple[Path, ...] = ()  # the same, of families of parts that the network, or the verifier, knows
     every: int = 1  # use every so many images of `bins`
     judge_anew: bool = False  # compute what depth images show of stored poses again, as after a change of that code

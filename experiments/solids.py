@@ -91,7 +91,7 @@ def arc(radius: float, broad: float, thick: float, begin: float, end: float) -> 
 def swept(sections: Float[np.ndarray, "n k 3"]) -> Solid:
     """Return what flat outlines span, each with the one after it; the first and the last are closed from their middles.
 
-    They are counterclockwise as one sees them who looks back from where they lead.
+    They are counterclockwise as seen from where they begin.
     """
     first, last = (np.broadcast_to(sections[row].mean(axis=0), sections[:1].shape) for row in (0, -1))
     return _around(np.concatenate([first, sections, last]))

@@ -12,8 +12,8 @@ import numpy as np
 
 from experiments.solids import Solid, arc, box, circle, moved, pierced, prism, rectangle, revolved, torus, union
 
-_UP_TO_X = (-np.pi / 2, 1)  # turns the z axis to -x
-_UP_TO_Y = (np.pi / 2, 0)  # turns the z axis to -y
+_TO_MINUS_X = (-np.pi / 2, 1)  # turn and axis that take the z axis there
+_TO_MINUS_Y = (np.pi / 2, 0)
 
 
 def handle(rng: np.random.Generator) -> Solid:
@@ -34,7 +34,7 @@ def bearing_block(rng: np.random.Generator) -> Solid:
     width = radius * rng.uniform(0.8, 1.6)
     bore = radius * rng.uniform(0.4, 0.75)
     ear = pierced(rectangle(cell, width), circle(min(cell, width) * rng.uniform(0.15, 0.3)), 0, thick)
-    ring = moved(pierced(circle(radius), circle(bore), -width / 2, width / 2), (0, 0, 0), *_UP_TO_Y)
+    ring = moved(pierced(circle(radius), circle(bore), -width / 2, width / 2), (0, 0, 0), *_TO_MINUS_Y)
     body = box((-radius - 0.1, -width / 2, 0), (radius + 0.1, width / 2, thick))
     place = radius + cell / 2
     return union(body, moved(ear, (-place, 0, 0)), moved(ear, (place, 0, 0)), moved(ring, (0, 0, radius + 0.2)))
@@ -73,7 +73,7 @@ def eye_bolt(rng: np.random.Generator) -> Solid:
     """A ring on a shank with a collar."""
     ring, thick, length = rng.uniform([9, 2, 18], [18, 5, 55])
     shank = thick * rng.uniform(0.7, 1.3)
-    upright = moved(torus(ring, thick), (0, 0, 0), *_UP_TO_Y)
+    upright = moved(torus(ring, thick), (0, 0, 0), *_TO_MINUS_Y)
     collar = prism(circle(shank * rng.uniform(1.5, 2.2)), -ring - 1.6 * thick, -ring - 0.3 * thick)
     return union(upright, prism(circle(shank), -ring - length, -ring), collar)
 
@@ -104,7 +104,7 @@ def corner_joint(rng: np.random.Generator) -> Solid:
     bar = rng.uniform(0.55, 0.95) * half
     outline = circle(bar) if rng.random() < 0.5 else circle(bar * np.sqrt(2), 4)
     parts = [box((-half, -half, -half), (half, half, half))]
-    turns = [(0.0, 0), _UP_TO_X, _UP_TO_Y, (np.pi, 0)]
+    turns = [(0.0, 0), _TO_MINUS_X, _TO_MINUS_Y, (np.pi, 0)]
     for row in rng.permutation(4)[: int(rng.integers(2, 5))]:
         parts.append(moved(prism(outline, 0, half * rng.uniform(1.8, 4.5)), (0, 0, 0), *turns[row]))
     return union(*parts)
@@ -157,8 +157,8 @@ def valve(rng: np.random.Generator) -> Solid:
     return union(
         body,
         flange,
-        moved(port, (0, 0, places[0]), *_UP_TO_X),
-        moved(stem, (0, 0, places[1]), -_UP_TO_X[0], 1),
+        moved(port, (0, 0, places[0]), *_TO_MINUS_X),
+        moved(stem, (0, 0, places[1]), -_TO_MINUS_X[0], 1),
     )
 
 

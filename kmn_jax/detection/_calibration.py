@@ -103,6 +103,8 @@ class Calibration:
 
 def averaged(models: Sequence[Calibration]) -> Calibration:
     """Return the model whose logits are the mean of those of models of the same evidence, with trees of one depth."""
+    if len({(model.names, len(model.weights), *map(len, model.values[:1])) for model in models}) != 1:
+        raise ValueError("models of other evidence, or of trees of another depth, have no mean")
     parts = [model.scaled(1 / len(models), 0.0) for model in models]
     return Calibration(
         parts[0].names,
@@ -173,13 +175,13 @@ def _by_range(
     return rows
 
 
-_SURE = 4.0  # log odds of a pose that leaves no doubt that its part is there
-COMPANY = ("own", f"best, at most {_SURE:g}")  # the evidence of `together`, see `company`
+_BEYOND_DOUBT = 4.0  # log odds of a pose that leaves no doubt that its part is there
+COMPANY = ("own", f"best, at most {_BEYOND_DOUBT:g}")  # the evidence of `together`, see `company`
 
 
 def company(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2"]:
     """Return of each pose of one scene its log odds, and those of the most probable pose there, if it is not sure."""
-    return np.stack([logits, np.full_like(logits, min(logits.max(initial=-np.inf), _SURE))], axis=1)
+    return np.stack([logits, np.full_like(logits, min(logits.max(initial=-np.inf), _BEYOND_DOUBT))], axis=1)
 
 
 @dataclass(frozen=True)
@@ -214,8 +216,8 @@ def in_company(
 
 
 def keeps_order(together: Calibration) -> bool:
-    """Tell whether of two poses of one scene the surer one stays the more probable one."""
-    return len(together.weights) > 0 and together.weights[0] > 0 and not together.values
+    """Tell whether the surer one of two poses of a scene stays the more probable one, and a sure one doubts none."""
+    return len(together.weights) == 2 and together.weights[0] > 0 and together.weights[1] >= 0 and not together.values
 
 
 def probabilities_bytes(probabilities: Probabilities) -> bytes:

@@ -267,8 +267,8 @@ def chosen(
 def reported(
     refined: Candidates, probabilities: Probabilities, part: DevicePart, config: DetectConfig, is_narrowed: bool
 ) -> tuple[Selection, Float[np.ndarray, " s"]]:
-    """Choose among refined candidates, and return also how probable those that stand are, given each other."""
+    """Choose among refined candidates those that are probable enough, also given each other, and say how probable."""
     choice = chosen(refined, probabilities.refined, part, config, probabilities.exact)
     probability = np.zeros(len(choice.kept))
     probability[choice.kept] = probabilities.of_scene(refined.evidence[choice.kept], is_narrowed)
-    return choice, probability
+    return choice._replace(kept=choice.kept & (probability >= config.reported)), probability

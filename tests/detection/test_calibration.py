@@ -155,8 +155,20 @@ def test_the_mean_of_models_says_the_mean_of_their_odds() -> None:
     for models in (trees, lines, trees[:1]):
         mean = np.mean([model.logit(evidence) for model in models], axis=0)
         np.testing.assert_allclose(averaged(models).logit(evidence), mean, rtol=1e-9, atol=1e-9)
-    with pytest.raises(ValueError, match="zip"):
-        averaged([trees[0], lines[0]])
+    for other in (lines[0], replace(trees[0], names=(*NAMES[:2], "another")), _shallower(trees[0])):
+        with pytest.raises(ValueError, match="have no mean"):
+            averaged([trees[0], other])
+
+
+def _shallower(model: Calibration) -> Calibration:
+    """Return a model of the upper half of its trees."""
+    leaves = len(model.values[0]) // 2
+    return replace(
+        model,
+        columns=tuple(nodes[: leaves - 1] for nodes in model.columns),
+        thresholds=tuple(nodes[: leaves - 1] for nodes in model.thresholds),
+        values=tuple(values[:leaves] for values in model.values),
+    )
 
 
 def test_evidence_that_decides_completely_keeps_finite_weights() -> None:
@@ -252,7 +264,8 @@ def test_a_file_comes_back_and_others_are_refused(tmp_path: Path) -> None:
     path.write_bytes(probabilities_bytes(replace(fitted, together=logistic)))
     with pytest.raises(InputError, match="of other evidence"):
         load_probabilities(path, NAMES)
-    for turned in (Calibration(COMPANY, (-0.1, 1.2), 0.0), Calibration(COMPANY, (0.0, 1.0), 0.0)):
+    for weights in ((-0.1, 1.2), (0.0, 1.0), (1.0, -0.1)):
+        turned = Calibration(COMPANY, weights, 0.0)
         path.write_bytes(probabilities_bytes(replace(fitted, together=turned)))
         with pytest.raises(InputError, match="the order of poses"):
             load_probabilities(path, NAMES)

@@ -63,6 +63,7 @@ def refine(
     config: DetectConfig = CONFIG,
     turned: dict[int, float] | None = None,
     part: DevicePart | None = None,
+    models: Probabilities = MODELS,
 ) -> tuple[list[list[int]], Choice]:
     """Return which candidates are refined in each turn, and the choice.
 
@@ -87,7 +88,7 @@ def refine(
 
     monkeypatch.setattr(choosing, "refined_candidates", refined)
     part = part or on_device(BOX)
-    return turns, choose_and_refine(found, MODELS, part, box_view(), 0, config, SearchConfig(), Clock())
+    return turns, choose_and_refine(found, models, part, box_view(), 0, config, SearchConfig(), Clock())
 
 
 def stand(choice: Choice) -> dict[int, float]:
@@ -157,6 +158,19 @@ def test_where_nothing_stands_no_others_are_refined(monkeypatch: pytest.MonkeyPa
     turns, choice = refine(monkeypatch, found, {0: [-3.0], 2: [-2.0, -2.0], 3: [-1.0, -1.0], 4: [5.0]})
     assert turns == [[0, 2, 4], [3], [3]]
     assert stand(choice) == {3: -1.0, 4: 5.0}
+
+
+def test_what_is_hardly_probable_where_none_is_sure_is_not_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = candidates((0.0, 3.0), (FAR, 3.0), (-FAR, 3.0))
+    doubt = replace(MODELS, together=Calibration(COMPANY, (1.0, 1.0), -4.0))
+    for best, others in ((1.5, {0: 1.5}), (5.0, {0: 5.0, 1: -1.0})):
+        turns, choice = refine(monkeypatch, found, {0: [best], 1: [-1.0] * 2, 2: [-3.0]}, models=doubt)
+        assert stand(choice) == pytest.approx(others)
+        said = choice.probability[choice.selection.kept]
+        told = np.array(list(others.values())) + min(best, 4.0) - 4.0
+        assert sorted(said) == pytest.approx(sorted(1 / (1 + np.exp(-told))))
+        assert (said >= CONFIG.reported).all()
+    assert turns == [[0, 1, 2], [1]]
 
 
 def test_what_looks_like_one_that_was_tried_is_not_refined(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.parametric_parts import FAMILIES, TEST_FAMILIES, VALIDATION_FAMILIES, write_parts
+from experiments.solids import Solid, torus
 from experiments.training_parts import COMPOUNDS, TRAINING_FAMILIES, larger_piece
 from experiments.various_parts import VARIOUS_FAMILIES
 from kmn_jax.objects import load_object
@@ -33,15 +34,33 @@ def test_solids_are_closed_and_wound_outwards(family: str) -> None:
 
 @pytest.mark.parametrize("family", ["washer", "hex_nut", "flanged_tube", "elbow"])
 def test_bores_go_through(family: str) -> None:
-    _, triangles = FAMILIES[family](np.random.default_rng(0))
+    assert _is_ring(FAMILIES[family](np.random.default_rng(0)))
+
+
+def test_a_torus_is_a_ring_of_its_radius() -> None:
+    vertices, triangles = torus(10.0, 2.0)
+    assert _is_ring((vertices, triangles))
+    from_axis = np.hypot(vertices[:, 0], vertices[:, 1])
+    np.testing.assert_allclose([from_axis.min(), from_axis.max()], [8, 12])
+    np.testing.assert_allclose(np.ptp(vertices[:, 2]), 4)
+
+
+def _is_ring(solid: Solid) -> bool:
+    """Tell whether a solid of one piece has one hole through it."""
+    _, triangles = solid
     edges = {tuple(sorted(pair)) for t in triangles.tolist() for pair in zip(t, [*t[1:], t[0]], strict=True)}
-    assert len(np.unique(triangles)) - len(edges) + len(triangles) == 0
+    return len(np.unique(triangles)) - len(edges) + len(triangles) == 0
 
 
 def test_no_family_is_in_two_sets() -> None:
     names = [*VALIDATION_FAMILIES, *VARIOUS_FAMILIES, *TEST_FAMILIES, *TRAINING_FAMILIES, *COMPOUNDS]
     assert len(set(names)) == len(names)
     assert set(names) == set(FAMILIES)
+
+
+def test_families_keep_their_places_by_which_their_parts_are_drawn() -> None:
+    in_order = [*VALIDATION_FAMILIES, *TEST_FAMILIES, *TRAINING_FAMILIES, *COMPOUNDS, *VARIOUS_FAMILIES]
+    assert list(FAMILIES)[: len(in_order)] == in_order
 
 
 def test_compounds_share_one_piece_and_differ_in_the_other() -> None:
