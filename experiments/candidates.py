@@ -303,9 +303,8 @@ def _with_reported(poses: Columns, searched: dict[int, DevicePart], fits: FitOpt
         rows = np.flatnonzero((poses["search"] == row) & (poses["turn"] >= 0))
         if len(rows):
             found = _choosable(poses["T_camera_object"][rows], poses["evidence"][rows])
-            kept, among = _chosen_in_turns(
-                found, poses["turn"][rows], *models[int(poses["object"][rows[0]])], on_device
-            )
+            of_others = models[int(poses["object"][rows[0]])]
+            kept, among = _chosen_in_turns(found, poses["turn"][rows], *of_others, on_device)
             due[rows], reported[rows] = among, kept
     return poses | {"due": due, "reported": reported}
 
