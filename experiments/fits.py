@@ -34,7 +34,7 @@ class FitOptions:
     """How models are fitted."""
 
     folds: int = 5
-    members: int = 3  # fits, whose mean is the model of refined poses
+    members: int = 3  # fits, whose mean is the model of refined poses by one error
     absent_weight: float = 3.0  # of refined poses of absent parts: real scenes hold much that is not the part
     reported_weight: float = 8.0  # of poses that detection reports: what is said of them is what users are told
     in_vain: float | None = None  # tell as if this share of the searches was in vain; none: as many as there were

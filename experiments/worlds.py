@@ -117,9 +117,10 @@ class Recipe:
     sensors: tuple[SensorKind, ...] = ()  # that take turns with each family's own, as in real scenes all may meet
 
 
-# Of parts that the network was trained with (`build_data surfels`): the fit of probabilities wants many kinds.
+# Of parts that the network was trained with (`build_data surfels`), for the pose verifier.
 TRAINING = Recipe(PARTS_SEED, tuple(TRAINING_FAMILIES), 1.0, sensors=("stereo", "time_of_flight"))
-# The same families of parts by other numbers, for the pose verifier, which needs more scans than parts.
+# The same families of parts by other numbers, for the verifier, which needs more scans than parts, and for the fit of
+# poses as they are found, which wants many kinds.
 VERIFIER = Recipe(14, tuple(TRAINING_FAMILIES), 1.0, parts_a_family=4, sensors=TRAINING.sensors)
 # Of two of these families each, as the verifier wants many kinds of parts, and such as have a piece in common.
 COMPOUND = Recipe(15, tuple(COMPOUNDS), 1.0, parts_a_family=1, sensors=TRAINING.sensors)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from experiments import fits
+from experiments import calibrate, fits
 from experiments.fits import FitOptions, Fitted, fit_together, mean_of, predict
-from kmn_jax.detection import company, expected_calibration_error, in_company
+from kmn_jax.detection import company, expected_calibration_error, in_company, load_probabilities
 from kmn_jax.errors import InputError
 
 _OBJECTS, _POSES, _COLUMNS = 10, 60, 12
@@ -131,6 +133,35 @@ def test_what_is_told_of_refined_poses_is_the_mean_of_models_of_either_error_on_
     said = 1 / (1 + np.exp(-held_out[reported]))
     assert said.mean() == pytest.approx(right[reported].mean(), rel=1e-3)  # and not the share that is exact
     assert results["summary"]["right"] == pytest.approx(right[reported].mean())
+
+
+def test_a_calibration_says_by_which_errors_poses_are_chosen_and_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fine = drawn(0, 20, spread=2.0, oddity=0.1)
+    in_vain = fine["search"] % 2 == 1
+    fine["evidence"] -= (in_vain & (fine["error"] < 0.1))[:, None]  # what speaks for them
+    fine["error"] = np.where(in_vain, np.inf, fine["error"])
+    fine["largest_error"] = np.where(fine["search"] % 4 == 0, fine["error"], np.maximum(fine["error"], 0.4))
+    fine["narrowed"] = fine["search"] % 3 == 0
+    found = fine | {"refined": ~fine["refined"], "reported": np.zeros_like(fine["refined"])}
+    poses = {name: np.concatenate([found[name], fine[name]]) for name in fine}
+    monkeypatch.setattr(calibrate, "poses_to_fit", lambda *given: poses)
+    monkeypatch.setattr(calibrate, "load_pretrained", lambda: None)
+    options = calibrate.Options(output=tmp_path / "a.json", members=2)
+    results = calibrate.calibrate(options)
+    written = load_probabilities(options.output or "", fits.EVIDENCE)
+    by_mean, by_largest = (predict(rows, options) for rows in (fine, fits.by_largest_error(fine)))
+    expected = {
+        "found": fit(found, options).model,
+        "refined": fits.fit(fine, options, mean_of(by_mean, by_largest)).model,
+        "exact": fit(fits.by_largest_error(fine), options).model,
+    }
+    for name, model in expected.items():
+        said = getattr(written, name).logit(fine["evidence"])
+        np.testing.assert_allclose(said, model.logit(fine["evidence"]), atol=1e-3)
+    assert set(results) == {*expected, "together"}
+    assert results["exact"]["summary"]["right"] < results["refined"]["summary"]["right"]
 
 
 def test_absent_parts_count_more_among_refined_poses() -> None:
