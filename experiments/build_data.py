@@ -10,8 +10,8 @@ test-sets    7 electronic and 7 industrial objects in 20 bins each, rendered by 
              digests are compared with those in `assets/test_sets.json`.
 validation-bins  the 50 validation components in 6 bins each, rendered by ray casting, one half as a perfect sensor sees
              them, the other as a structured-light scanner: what the probabilities of detections are fitted on.
-worlds       bins, trays and tables of many kinds (`experiments/worlds.py`), of parts made by parameters: three to
-             train the pose verifier with, of which one is also to fit probabilities on, as two others, and one to test on.
+worlds       bins, trays and tables of many kinds (`experiments/worlds.py`), of parts made by parameters: three
+             to train the pose verifier with, one of them and two others to fit probabilities on, and one to test on.
 cad-folder   the pack of all CAD files in and below a folder, of which every tenth is for validation; with
              `--pack.drops 0` without bins, which is enough for configs with worlds.
 per-object   the pack of one part, for a network of its own: 160 training and 160 validation scenes.

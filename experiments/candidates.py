@@ -12,10 +12,11 @@ from typing import Any, cast
 from zipfile import BadZipFile
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Int
 
-from experiments.fits import FitOptions, by_largest_error, held_out_models, model_of, told
+from experiments.fits import FitOptions, model_of, models_of_others, told
 from experiments.fpfh import fpfh_poses
+from experiments.reported_poses import with_reported
 from experiments.searches import SEARCHED, Columns, Search, Sources, searches
 from experiments.two_at_once import AT_ONCE, side_by_side
 from kmn_jax.detection import (
@@ -29,10 +30,8 @@ from kmn_jax.detection import (
     DetectConfig,
     DevicePart,
     SearchConfig,
-    averaged,
     chosen,
     explore,
-    in_unsure_places,
     next_best_rows,
     picture_evidence,
     refined_candidates,
@@ -161,7 +160,7 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
     poses = _joined(found_parts)
     none = np.zeros(len(poses["error"]), dtype=bool)
     poses |= {"refined": none, "turn": np.full(len(none), -1), "reported": none}
-    others, of_all = _models(poses, fits), model_of(poses, fits)
+    others, of_all = models_of_others(poses, fits), model_of(poses, fits)
     searched: dict[int, DevicePart] = {}
 
     def refined(search: Search) -> Columns:
@@ -183,7 +182,7 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
     unknown = replace(sources, known_worlds=())  # whose searches come last: the others stay in their rows
     more = _joined(side_by_side(refined_part, searches(unknown, network), at_once))
     none = np.zeros(len(more["error"]), dtype=bool)
-    return _with_reported(_joined([poses, more | {"refined": ~none, "reported": none}]), searched, fits)
+    return with_reported(_joined([poses, more | {"refined": ~none, "reported": none}]), searched, fits)
 
 
 class _Kept:
@@ -267,7 +266,7 @@ def judged_anew(poses: Columns, names: tuple[str, ...], sources: Sources, fits: 
     judged = np.flatnonzero(all_of_picture | poses["refined"])
     sources = sources if all_of_picture else replace(sources, known_worlds=())
     side_by_side(judge, searches_of({name: values[judged] for name, values in poses.items()}, sources, network))
-    return _with_reported(poses | {"evidence": evidence}, searched, fits)
+    return with_reported(poses | {"evidence": evidence}, searched, fits)
 
 
 def searches_of(poses: Columns, sources: Sources, network: Model) -> Iterator[tuple[Search, Int[np.ndarray, " k"]]]:
@@ -290,61 +289,6 @@ def searches_of(poses: Columns, sources: Sources, network: Model) -> Iterator[tu
 def _check(is_same: bool) -> None:
     if not is_same:
         raise InputError("the bins are not those that the stored poses were found in: remove the file")
-
-
-def _with_reported(poses: Columns, searched: dict[int, DevicePart], fits: FitOptions) -> Columns:
-    """Return poses with what detection refines and reports, by models that do not know the image's object."""
-    none = np.zeros(len(poses["error"]), dtype=bool)  # it is not known yet, or that of other evidence
-    fine = {name: values[poses["refined"]] for name, values in (poses | {"reported": none}).items()}
-    of_mean, exact = (_models(rows, fits) for rows in (fine, by_largest_error(fine)))
-    models = {number: (averaged([of_mean[number], exact[number]]), exact[number]) for number in exact}
-    due, reported = none.copy(), none.copy()
-    for row, on_device in searched.items():
-        rows = np.flatnonzero((poses["search"] == row) & (poses["turn"] >= 0))
-        if len(rows):
-            found = _choosable(poses["T_camera_object"][rows], poses["evidence"][rows])
-            of_others = models[int(poses["object"][rows[0]])]
-            kept, among = _chosen_in_turns(found, poses["turn"][rows], *of_others, on_device)
-            due[rows], reported[rows] = among, kept
-    return poses | {"due": due, "reported": reported}
-
-
-def _chosen_in_turns(
-    found: Candidates, turns: Int[np.ndarray, " s"], model: Calibration, exact: Calibration, on_device: DevicePart
-) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
-    """Return which refined poses detection reports, and among which it chooses.
-
-    Once some pose is sure, later turns come to places where one stands that is not. Which are sure is told before the
-    model is scaled, and poses do not vouch for each other; nor is known what would become of unsure ones that are
-    refined once more.
-    """
-
-    def kept_of(rows: Bool[np.ndarray, " s"]) -> Bool[np.ndarray, " s"]:
-        return np.asarray(chosen(found._replace(usable=rows), model, on_device, _CONFIG, exact).kept)
-
-    due = turns == 0
-    kept = kept_of(due)
-    for turn in range(1, 1 + turns.max()):
-        sure = kept & (model.probability(found.evidence) >= _CONFIG.sure)
-        if not sure.any():
-            break
-        poses = found.T_camera_object
-        more = (turns == turn) & in_unsure_places(poses, poses[kept & ~sure], poses[sure], on_device)
-        if more.any():
-            due |= more
-            kept = kept_of(due)
-    return kept, due
-
-
-def _models(poses: Columns, fits: FitOptions) -> dict[int, Calibration]:
-    """Return for each object the model that is fitted to the poses of others."""
-    return {int(name): fitted for names, fitted in held_out_models(poses, fits) for name in names}
-
-
-def _choosable(poses: Float32[np.ndarray, "s 4 4"], evidence: Float32[np.ndarray, "s f"]) -> Candidates:
-    """Return candidates that can be chosen among, and nothing else."""
-    none = np.zeros(len(poses), dtype=np.int32)
-    return Candidates(poses, np.ones(len(poses), dtype=bool), evidence, none, none, cast(Any, None), none)
 
 
 def _joined(columns: list[Columns]) -> Columns:

@@ -68,6 +68,11 @@ def held_out_models(
     return list(zip(folds, side_by_side(of_others, folds), strict=True))
 
 
+def models_of_others(poses: dict[str, np.ndarray], options: FitOptions) -> dict[int, Calibration]:
+    """Return for each object a model that is fitted to poses of others."""
+    return {int(name): fitted for names, fitted in held_out_models(poses, options) for name in names}
+
+
 def _folds(poses: dict[str, np.ndarray], options: FitOptions) -> list[Int[np.ndarray, " o"]]:
     """Return the objects of poses in groups, each of which has its turn as what is not fitted to."""
     names = np.unique(poses["object"])
@@ -136,12 +141,23 @@ def fit(poses: dict[str, np.ndarray], options: FitOptions, predicted: Predicted)
     if not poses["reported"].any():
         return Fitted(model, held_out, _judged(poses, held_out, np.ones(len(right))))
     judged, told_of = _reported(poses), held_out[poses["reported"]]
-    counts = _as_asked(judged, options)
-    scale = fit_logistic(told_of[:, None], right[poses["reported"]], ("logit",), _SCALE_RIDGE, weights=counts)
+    factor, offset = scale_of(judged, told_of, options)
+    model, held_out = model.scaled(factor, offset), factor * held_out + offset
+    return Fitted(model, held_out, _judged(judged, held_out[poses["reported"]], _as_asked(judged, options)))
+
+
+def scale_of(
+    reported: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: FitOptions
+) -> tuple[float, float]:
+    """Return by which factor and offset log odds of reported poses are right as often as they say.
+
+    Raises InputError if what they say is wrong.
+    """
+    right, counts = reported["error"] < THRESHOLD, _as_asked(reported, options)
+    scale = fit_logistic(logits[:, None], right, ("logit",), _SCALE_RIDGE, weights=counts)
     if scale.weights[0] <= 0:
         raise InputError("poses are right no more often where models of other objects say so: give more bins")
-    model, held_out = model.scaled(scale.weights[0], scale.bias), scale.weights[0] * held_out + scale.bias
-    return Fitted(model, held_out, _judged(judged, held_out[poses["reported"]], counts))
+    return scale.weights[0], scale.bias
 
 
 def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: FitOptions) -> Fitted:

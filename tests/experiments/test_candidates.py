@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from experiments import candidates as module
+from experiments import reported_poses
 from experiments.calibrate import Options, calibrate
 from experiments.candidates import poses_to_fit
 from experiments.fits import FitOptions
@@ -31,6 +32,7 @@ from kmn_jax.models import Model, create_model, load_pretrained
 from kmn_jax.objects import PartArrays
 from kmn_jax.simulate import Surfels
 from tests.reference.clouds import box_cloud
+from tests.reference.named_models import Named
 from tests.reference.networks import TINY
 
 
@@ -39,7 +41,7 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let two searches be made again, whose pictures tell search, pose and kind of evidence apart.
 
     Models are named by how many poses they take for right: what chooses is to be the mean of those of ADI and of MSSD,
-    and the exact one that of MSSD.
+    at last on the scale of what was chosen at first, and the exact one that of MSSD.
     """
 
     def searches(sources: Sources, network: Any) -> Any:
@@ -57,21 +59,31 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
     def shown_to_verifier(poses: np.ndarray, part: int, scene: int) -> np.ndarray:
         return -poses[:, 0, 3] - 10 * scene
 
-    def models(poses: dict[str, np.ndarray], fits: FitOptions) -> Any:
+    def models(poses: dict[str, np.ndarray], fits: FitOptions) -> dict[int, int]:
         assert poses["refined"].all()
-        return [(np.unique(poses["object"]), int((poses["error"] < 0.1).sum()))]
+        return dict.fromkeys(np.unique(poses["object"]).tolist(), int((poses["error"] < 0.1).sum()))
 
-    def all_but_the_first(found: Candidates, model: tuple[int, int], part: Any, config: Any, exact: int) -> Any:
-        assert (model, exact) == ((5, 2), 2)
+    def scale(poses: dict[str, np.ndarray], logits: np.ndarray, fits: FitOptions) -> tuple[float, float]:
+        assert asked == {(5, 2)}
+        np.testing.assert_array_equal(poses["T_camera_object"][:, 0, 3], [2, 3])
+        return 1.5, 0.5
+
+    asked: set[Named] = set()
+
+    def all_but_the_first(found: Candidates, model: Named, part: Any, config: Any, exact: int) -> Any:
+        asked.add(model)
+        assert model in {(5, 2), (5, 2, 1.5, 0.5)}
+        assert exact == 2
         assert found.evidence.shape[1] == len(EVIDENCE)
         return SimpleNamespace(kept=np.arange(len(found.usable)) > 0)
 
     monkeypatch.setattr(module, "searches", searches)
     monkeypatch.setattr(module, "picture_evidence", shown)
     monkeypatch.setattr(module, "verified", shown_to_verifier)
-    monkeypatch.setattr(module, "held_out_models", models)
-    monkeypatch.setattr(module, "averaged", tuple)
-    monkeypatch.setattr(module, "chosen", all_but_the_first)
+    monkeypatch.setattr(reported_poses, "models_of_others", models)
+    monkeypatch.setattr(reported_poses, "averaged", Named)
+    monkeypatch.setattr(reported_poses, "scale_of", scale)
+    monkeypatch.setattr(reported_poses, "chosen", all_but_the_first)
 
 
 @pytest.fixture(scope="module")
@@ -216,7 +228,8 @@ def test_poses_are_chosen_among_as_those_of_a_search(motor: DevicePart) -> None:
     weights = tuple(float(name == "near") for name in EVIDENCE)
     model = Calibration(EVIDENCE, weights, 0.0)
     whole = chosen(found, model, motor, DetectConfig(reported=0.0)).kept
-    few = chosen(module._choosable(poses[usable], evidence[usable]), model, motor, DetectConfig(reported=0.0)).kept
+    choosable = reported_poses.choosable(poses[usable], evidence[usable])
+    few = chosen(choosable, model, motor, DetectConfig(reported=0.0)).kept
     np.testing.assert_array_equal(few, whole[usable])
     assert 0 < few.sum() < len(few)
 
@@ -229,17 +242,17 @@ def test_of_later_turns_detection_sees_what_is_near_an_unsure_pose(motor: Device
     poses[:, 0, 3] = places
     evidence = np.zeros((6, len(EVIDENCE)), dtype=np.float32)
     evidence[:, 0] = odds
-    found = module._choosable(poses, evidence)
-    kept, due = module._chosen_in_turns(found, turns, exact, exact, motor)
+    found = reported_poses.choosable(poses, evidence)
+    kept, due = reported_poses._chosen_in_turns(found, turns, exact, exact, motor)
     assert due.tolist() == [True, False, True, True, False, False]
     assert kept.tolist() == [True, False, False, True, False, False]
     evidence[2, 0] = -3.0  # nothing stands where the second copy is
-    kept, due = module._chosen_in_turns(found, turns, exact, exact, motor)
+    kept, due = reported_poses._chosen_in_turns(found, turns, exact, exact, motor)
     assert due.tolist() == [True, False, True, False, False, False]
     evidence[0, 0], evidence[2, 0] = 2.0, 0.0  # nothing is sure any more
-    kept, due = module._chosen_in_turns(found, turns, exact, exact, motor)
+    kept, due = reported_poses._chosen_in_turns(found, turns, exact, exact, motor)
     assert due.tolist() == [True, False, True, False, False, False]
-    kept, due = module._chosen_in_turns(found, np.minimum(turns, 0), exact, exact, motor)
+    kept, due = reported_poses._chosen_in_turns(found, np.minimum(turns, 0), exact, exact, motor)
     assert due.tolist() == [True] * 5 + [False]
     assert kept.tolist() == [False, True, False, False, True, False]
 

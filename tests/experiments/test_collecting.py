@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 
 from experiments import candidates as module
+from experiments import reported_poses
 from experiments.fits import FitOptions, weights_of
 from experiments.searches import Sources
 from kmn_jax.detection import EVIDENCE, Calibration, Candidates, DetectConfig
 from kmn_jax.errors import InputError
 from kmn_jax.models import Model, create_model
+from tests.reference.named_models import Named
 from tests.reference.networks import TINY
 from tests.reference.parts import box_part, on_device
 
@@ -62,9 +64,12 @@ class Asked:
         monkeypatch.setattr(module, "_first_seeds", lambda search: None)
         monkeypatch.setattr(module, "_propose", lambda search, *given: partial(self.propose, search.scene))
         monkeypatch.setattr(module, "_explored", lambda search, propose, model: self.found(2, 10.0 + model))
-        monkeypatch.setattr(module, "_models", self.models)
+        for of in (module, reported_poses):
+            monkeypatch.setattr(of, "models_of_others", self.models)
+            monkeypatch.setattr(of, "chosen", self.all_of)
         monkeypatch.setattr(module, "model_of", lambda poses, fits: 5)
-        monkeypatch.setattr(module, "chosen", self.all_of)
+        monkeypatch.setattr(reported_poses, "averaged", Named)
+        monkeypatch.setattr(reported_poses, "scale_of", lambda *given: (1.5, 0.5))
         monkeypatch.setattr(module, "next_best_rows", lambda *given: np.zeros(0, dtype=int))
         monkeypatch.setattr(module, "refined_candidates", lambda part, scene, found, *_: found)
 
@@ -142,9 +147,9 @@ def test_other_forms_of_poses_have_their_turns(monkeypatch: pytest.MonkeyPatch, 
         return np.array([False, True, False]), np.array([True, True, False])
 
     monkeypatch.setattr(module, "refined_candidates", forms)
-    monkeypatch.setattr(module, "_chosen_in_turns", in_turns)
+    monkeypatch.setattr(reported_poses, "_chosen_in_turns", in_turns)
     result = module.collect(Sources(), FitOptions(), network)
-    assert seen == [[0, 1, 0]]
+    assert seen == [[0, 1, 0]] * 2  # by models as they come, and by scaled ones
     assert result["turn"].tolist() == [-1, 0, 1, 0]
     assert result["reported"].tolist() == [False, False, True, False]
     assert result["due"].tolist() == [False, True, True, False]
@@ -168,7 +173,12 @@ def test_what_was_searched_before_an_end_is_not_searched_again(
     count = len(asked.chosen_by)
     module.collect(SOURCES, FitOptions(), network, folder)
     assert len(asked.proposed) == 4
-    assert sorted(asked.chosen_by[count:]) == [(0, 1), (1, 2)]  # for what is reported alone
+    assert sorted(asked.chosen_by[count:]) == [
+        (0, (1, 1)),
+        (1, (2, 2)),
+        (0, (1, 1, 1.5, 0.5)),
+        (1, (2, 2, 1.5, 0.5)),
+    ]  # for what is reported alone
     (folder / "b-found.npz").write_bytes(b"no numbers")
     with pytest.raises(InputError, match=r"b-found.npz holds no poses .*: remove it"):
         module.collect(SOURCES, FitOptions(), network, folder)
