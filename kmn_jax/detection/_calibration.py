@@ -191,7 +191,7 @@ class Probabilities:
     `refined` is the mean of models that are fitted to either error, scaled to say how probable it is that the points
     are in their places on average. `exact` is of all of them being so: it tells poses of one place apart that are
     turned against each other. `together` is of poses in one scene, by what `refined` says of each: where none is sure,
-    the part may not be there at all, and where one is, it is, see `in_company`.
+    the part may not be there at all, see `in_company`.
     """
 
     found: Calibration
@@ -209,7 +209,8 @@ def in_company(
 ) -> Float[np.ndarray, " s"]:
     """Return the log odds of poses, given their `company`, in scenes of which was said where parts are, or not.
 
-    Where it was not, there are walls, and other parts, to be mistaken: no pose there is more probable for a sure one.
+    Where it was not, there may be other things to be mistaken than any that probabilities were fitted to: no pose there
+    is more probable for a sure one, though in the fit such poses are right more often than is then said.
     """
     told = together.logit(columns)
     return np.where(is_narrowed, told, np.minimum(columns[:, 0], told))
