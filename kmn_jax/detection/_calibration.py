@@ -175,7 +175,7 @@ def _by_range(
     return rows
 
 
-_BEYOND_DOUBT = 4.0  # log odds of a pose that leaves no doubt that its part is there
+_BEYOND_DOUBT = 5.0  # log odds of a pose that leaves no doubt that its part is there
 COMPANY = ("own", f"best, at most {_BEYOND_DOUBT:g}")  # the evidence of `together`, see `company`
 
 

@@ -162,12 +162,12 @@ def test_where_nothing_stands_no_others_are_refined(monkeypatch: pytest.MonkeyPa
 
 def test_what_is_hardly_probable_where_none_is_sure_is_not_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     found = candidates((0.0, 3.0), (FAR, 3.0), (-FAR, 3.0))
-    doubt = replace(MODELS, together=Calibration(COMPANY, (1.0, 1.0), -4.0))
-    for best, others in ((1.5, {0: 1.5}), (5.0, {0: 5.0, 1: -1.0})):
+    doubt = replace(MODELS, together=Calibration(COMPANY, (1.0, 1.0), -5.0))
+    for best, others in ((2.0, {0: 2.0}), (6.0, {0: 6.0, 1: -1.0})):
         turns, choice = refine(monkeypatch, found, {0: [best], 1: [-1.0] * 2, 2: [-3.0]}, models=doubt)
         assert stand(choice) == pytest.approx(others)
         said = choice.probability[choice.selection.kept]
-        told = np.array(list(others.values())) + min(best, 4.0) - 4.0
+        told = np.array(list(others.values())) + min(best, 5.0) - 5.0
         assert sorted(said) == pytest.approx(sorted(1 / (1 + np.exp(-told))))
         assert (said >= CONFIG.reported).all()
     assert turns == [[0, 1, 2], [1]]
