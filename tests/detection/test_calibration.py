@@ -217,7 +217,7 @@ def test_poses_are_doubted_where_none_is_sure_and_vouched_for_where_parts_are_sa
         np.testing.assert_allclose(wide, np.minimum(alone, narrowed), rtol=1e-12)
         for together in (wide, narrowed):
             assert (np.diff(together[np.argsort(alone, kind="stable")]) >= 0).all()  # the order stays
-    doubtful, with_a_sure_one, with_a_surer_one = (np.array([[1.5], [x]]) for x in (1.0, 4.0, 9.0))
+    doubtful, with_a_sure_one, with_a_surer_one = (np.array([[1.5], [x]]) for x in (1.0, 5.0, 9.0))
     for is_narrowed in (False, True):
         assert models.of_scene(doubtful, is_narrowed)[0] < 0.5 * own.probability(doubtful)[0]
         sure, surer = (models.of_scene(some, is_narrowed)[0] for some in (with_a_sure_one, with_a_surer_one))
