@@ -176,6 +176,7 @@ def _by_range(
 
 
 _BEYOND_DOUBT = 5.0  # log odds of a pose that leaves no doubt that its part is there
+_MOST_ADDED = 1.0  # log odds that company adds to a pose in a scan of which nothing was said
 COMPANY = ("own", f"best, at most {_BEYOND_DOUBT:g}")  # the evidence of `together`, see `company`
 
 
@@ -209,11 +210,11 @@ def in_company(
 ) -> Float[np.ndarray, " s"]:
     """Return the log odds of poses, given their `company`, in scenes of which was said where parts are, or not.
 
-    Where it was not, there may be other things to be mistaken than any that probabilities were fitted to: no pose there
-    is more probable for a sure one, though in the fit such poses are right more often than is then said.
+    Where it was not, there may be other things to be mistaken than any that probabilities were fitted to: there a sure
+    pose adds at most `_MOST_ADDED` to what is said of another one.
     """
     told = together.logit(columns)
-    return np.where(is_narrowed, told, np.minimum(columns[:, 0], told))
+    return np.where(is_narrowed, told, np.minimum(columns[:, 0] + _MOST_ADDED, told))
 
 
 def keeps_order(together: Calibration) -> bool:

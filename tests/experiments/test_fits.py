@@ -102,15 +102,14 @@ def test_poses_of_one_search_are_told_by_each_other() -> None:
     losses = [np.logaddexp(0, np.where(outcome, -1, 1) * odds)[~wide].mean() for odds in (own, held_out)]
     assert losses[1] < 0.96 * losses[0]
     assert (held_out > own)[~wide].mean() > 0.2
-    assert (held_out <= own)[wide].all()
+    assert (held_out <= own + 1 + 1e-9)[wide].all()
     assert (held_out < own)[wide].mean() > 0.2
     narrow = fit_together(rows | {"narrowed": np.ones_like(rows["narrowed"])}, logits, FitOptions())
     assert narrow.model == model
-    np.testing.assert_allclose(held_out[wide], np.minimum(own, narrow.held_out)[wide])
-    # What is judged is what is said, of wide scans too little.
+    np.testing.assert_allclose(held_out[wide], np.minimum(own + 1, narrow.held_out)[wide])
+    # What is judged is what is said.
     said = 1 / (1 + np.exp(-held_out))
     assert results["summary"]["expected calibration error"] == pytest.approx(expected_calibration_error(said, outcome))
-    assert said[wide].mean() < outcome[wide].mean() - 0.01
     np.testing.assert_allclose(in_company(company(own[:poses]), model, True), held_out[:poses], atol=0.3)
     # As if more searches were in vain: then poses without a sure one are doubted more.
     often, _, _ = fit_together(rows, logits, FitOptions(in_vain=0.8))
