@@ -16,8 +16,7 @@ model holds for the most probable, which is fitted to whether all points are in 
 (ADI). How probable it is that their mean is, is then said by both together: what lies on another part is seldom in
 place in all of its points. Models are too sure of themselves about kinds of objects that they were not fitted to: so
 the scales of the refined poses' models are fitted to what detection would report by models that do not know the kind.
-From the same poses, of scans of which is known where parts are, a fourth model learns what poses of one scene say about
-each other.
+From the same poses a fourth model learns what those of one scene say about each other.
 """
 
 from __future__ import annotations

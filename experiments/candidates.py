@@ -16,7 +16,7 @@ from jaxtyping import Int
 
 from experiments.fits import FitOptions, model_of, models_of_others, told
 from experiments.fpfh import fpfh_poses
-from experiments.reported_poses import with_reported
+from experiments.reported_poses import CONFIG, with_reported
 from experiments.searches import SEARCHED, Columns, Search, Sources, searches
 from experiments.two_at_once import AT_ONCE, side_by_side
 from kmn_jax.detection import (
@@ -27,7 +27,6 @@ from kmn_jax.detection import (
     Calibration,
     Candidates,
     Clock,
-    DetectConfig,
     DevicePart,
     SearchConfig,
     chosen,
@@ -44,8 +43,7 @@ from kmn_jax.files import make_folder, write_whole
 from kmn_jax.models import Model
 from kmn_jax.objects import model_digest
 
-_CONFIG = DetectConfig()  # of the detection that probabilities are for
-_LOOSE = replace(_CONFIG, reported=0.03)  # refines more than that does, so that the fit sees what is just refused
+_LOOSE = replace(CONFIG, reported=0.03)  # refines more than that does, so that the fit sees what is just refused
 _COLUMNS = (  # of what is stored
     "evidence",
     "error",
@@ -61,7 +59,7 @@ _COLUMNS = (  # of what is stored
     "reported",
 )
 _HOW = 10  # version of how is collected: it goes up with what is kept of a search, what is right, and how it is judged
-_CHOSEN = 1  # version of how what is reported is chosen among what was collected: with it stored searches stay
+_CHOSEN = 1  # version of how what is reported is chosen (`experiments.reported_poses`): stored searches stay
 _IN_MEMORY = 600  # searches, of each of which what was found first, crops and all, takes 10 MB
 _READING = Lock()  # NumPy parses the headers of arrays, which CPython 3.11 sometimes refuses two threads at once
 
@@ -142,7 +140,7 @@ def collect(sources: Sources, fits: FitOptions, network: Model, folder: Path | N
     stays as it is, chosen by the models of when it was refined: of images that were built anew make another one. Raises
     InputError if the folder is of other weights or settings.
     """
-    config = _CONFIG.search_of(network.config)
+    config = CONFIG.search_of(network.config)
     first: dict[int, Candidates] = {}
     kept = _Kept(folder, repr((_HOW, SEARCHED, sources.method, *_settings(fits, network), EVIDENCE)))
     at_once = 1 if sources.method == "FPFH" else AT_ONCE  # whose random numbers are those of the whole process
@@ -222,11 +220,11 @@ def _turns(
 
     Those that are just not probable enough for detection, of which there is one turn, are -1.
     """
-    loose, first = (chosen(found, chooser, on_device, config) for config in (_LOOSE, _CONFIG))
+    loose, first = (chosen(found, chooser, on_device, config) for config in (_LOOSE, CONFIG))
     rows = [np.flatnonzero(first.kept | first.contenders)]
     all_unsure = found.T_camera_object[rows[0]], found.T_camera_object[:0]
-    while len(rows[-1]) > 0 and len(rows) <= _CONFIG.next_best:
-        rows.append(next_best_rows(found, np.concatenate(rows), *all_unsure, chooser, on_device, _CONFIG))
+    while len(rows[-1]) > 0 and len(rows) <= CONFIG.next_best:
+        rows.append(next_best_rows(found, np.concatenate(rows), *all_unsure, chooser, on_device, CONFIG))
     others = loose.kept | loose.contenders
     others[np.concatenate(rows)] = False
     rows.append(np.flatnonzero(others))
@@ -246,7 +244,7 @@ def judged_anew(poses: Columns, names: tuple[str, ...], sources: Sources, fits: 
     for column, name in enumerate(EVIDENCE):
         if name not in made:
             evidence[:, column] = poses["evidence"][:, names.index(name)]
-    config = _CONFIG.search_of(network.config)
+    config = CONFIG.search_of(network.config)
     searched: dict[int, DevicePart] = {}
     all_of_picture = not made.isdisjoint(PICTURE_EVIDENCE)
     of_picture = np.array([EVIDENCE.index(name) for name in PICTURE_EVIDENCE])
@@ -322,15 +320,16 @@ def _explored(
     search: Search, propose: Callable[[Int[np.ndarray, " c"]], Candidates], chooser: Calibration
 ) -> Candidates:
     """Return the poses that detection finds in all of its rounds."""
-    return explore(search.scene, search.part, propose, chooser, _CONFIG, Clock())[0]
+    return explore(search.scene, search.part, propose, chooser, CONFIG, Clock())[0]
 
 
 def _made_of(sources: Sources, fits: FitOptions, network: Model) -> str:
     """Say what candidates are made of."""
     folders = str(sources.bins), *(tuple(map(str, worlds)) for worlds in (sources.worlds, sources.known_worlds))
-    return repr((_HOW, _CHOSEN, SEARCHED, sources.method, folders, sources.every, *_settings(fits, network)))
+    chosen_by = _CHOSEN, fits.in_vain
+    return repr((_HOW, *chosen_by, SEARCHED, sources.method, folders, sources.every, *_settings(fits, network)))
 
 
 def _settings(fits: FitOptions, network: Model) -> tuple[Any, ...]:
     decisive = fits.folds, fits.members, fits.absent_weight, TREE_SETTINGS  # for what is refined and reported
-    return decisive, model_digest(network), _CONFIG, _CONFIG.search_of(network.config), _LOOSE
+    return decisive, model_digest(network), CONFIG, CONFIG.search_of(network.config), _LOOSE

@@ -163,7 +163,8 @@ def scale_of(
 def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], options: FitOptions) -> Fitted:
     """Fit the model of what reported poses of one search say about each other, given the log odds of each.
 
-    Raises InputError if the less sure ones are right.
+    Judged are those that it leaves in the list. Raises InputError if poses are right less often the surer they are, or
+    the best of them is.
     """
     logits, poses = logits[poses["reported"]], _reported(poses)
     right, narrowed, counts = poses["error"] < THRESHOLD, poses["narrowed"], _as_asked(poses, options)
@@ -175,14 +176,20 @@ def fit_together(poses: dict[str, np.ndarray], logits: Float[np.ndarray, " s"], 
     def of_company(rows: Bool[np.ndarray, " s"]) -> Calibration:
         model = fit_logistic(columns[rows], right[rows], COMPANY, _SCALE_RIDGE, weights=counts[rows])
         if not keeps_order(model):
-            raise InputError("of poses of one image those are right that are less sure: give more bins")
+            raise InputError(
+                "poses of an image are right less often where they, or its best, are surer: give more bins"
+            )
         return model
 
     held_out = np.zeros(len(logits))
     for names in _folds(poses, options):
         own = np.isin(poses["object"], names)
         held_out[own] = in_company(columns[own], of_company(~own), narrowed[own])
-    return Fitted(of_company(np.ones(len(right), dtype=bool)), held_out, _judged(poses, held_out, counts))
+    listed = 1 / (1 + np.exp(-held_out)) >= DetectConfig().reported
+    judged = {name: values[listed] for name, values in poses.items()}
+    return Fitted(
+        of_company(np.ones(len(right), dtype=bool)), held_out, _judged(judged, held_out[listed], counts[listed])
+    )
 
 
 def _reported(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

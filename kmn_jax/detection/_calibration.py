@@ -176,12 +176,12 @@ def _by_range(
 
 
 _BEYOND_DOUBT = 5.0  # log odds of a pose that leaves no doubt that its part is there
-_MOST_ADDED = 1.0  # log odds that company adds to a pose in a scan of which nothing was said
+_MOST_ADDED = 1.0  # log odds that company adds at most to a pose, in a scan of which nothing was said
 COMPANY = ("own", f"best, at most {_BEYOND_DOUBT:g}")  # the evidence of `together`, see `company`
 
 
 def company(logits: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2"]:
-    """Return of each pose of one scene its log odds, and those of the most probable pose there, if it is not sure."""
+    """Return of each pose of one scene its log odds, and those of the most probable one, at most `_BEYOND_DOUBT`."""
     return np.stack([logits, np.full_like(logits, min(logits.max(initial=-np.inf), _BEYOND_DOUBT))], axis=1)
 
 
@@ -191,8 +191,8 @@ class Probabilities:
 
     `refined` is the mean of models that are fitted to either error, scaled to say how probable it is that the points
     are in their places on average. `exact` is of all of them being so: it tells poses of one place apart that are
-    turned against each other. `together` is of poses in one scene, by what `refined` says of each: where none is sure,
-    the part may not be there at all, see `in_company`.
+    turned against each other. `together` is of poses in one scene, by what `refined` says of each: where none leaves
+    no doubt, the part may not be there at all, see `in_company`.
     """
 
     found: Calibration
@@ -210,15 +210,15 @@ def in_company(
 ) -> Float[np.ndarray, " s"]:
     """Return the log odds of poses, given their `company`, in scenes of which was said where parts are, or not.
 
-    Where it was not, there may be other things to be mistaken than any that probabilities were fitted to: there a sure
-    pose adds at most `_MOST_ADDED` to what is said of another one.
+    Where it was not, there may be other things to be mistaken than any that probabilities were fitted to: there a pose
+    beyond doubt adds at most `_MOST_ADDED` to what is said of another one.
     """
     told = together.logit(columns)
     return np.where(is_narrowed, told, np.minimum(columns[:, 0] + _MOST_ADDED, told))
 
 
 def keeps_order(together: Calibration) -> bool:
-    """Tell whether the surer one of two poses of a scene stays the more probable one, and a sure one doubts none."""
+    """Tell whether of two poses of a scene the surer one stays more probable, and sure company speaks against none."""
     return len(together.weights) == 2 and together.weights[0] > 0 and together.weights[1] >= 0 and not together.values
 
 

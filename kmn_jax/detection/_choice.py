@@ -267,7 +267,10 @@ def chosen(
 def reported(
     refined: Candidates, probabilities: Probabilities, part: DevicePart, config: DetectConfig, is_narrowed: bool
 ) -> tuple[Selection, Float[np.ndarray, " s"]]:
-    """Choose among refined candidates those that are probable enough, also given each other, and say how probable."""
+    """Choose among refined candidates those that are probable enough, also given each other, and say how probable.
+
+    What is then too improbable leaves its place empty: a rival there would be no surer.
+    """
     choice = chosen(refined, probabilities.refined, part, config, probabilities.exact)
     probability = np.zeros(len(choice.kept))
     probability[choice.kept] = probabilities.of_scene(refined.evidence[choice.kept], is_narrowed)

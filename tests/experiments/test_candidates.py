@@ -37,11 +37,11 @@ from tests.reference.networks import TINY
 
 
 @pytest.fixture
-def searched(monkeypatch: pytest.MonkeyPatch) -> None:
+def searched(monkeypatch: pytest.MonkeyPatch) -> set[Named]:
     """Let two searches be made again, whose pictures tell search, pose and kind of evidence apart.
 
     Models are named by how many poses they take for right: what chooses is to be the mean of those of ADI and of MSSD,
-    at last on the scale of what was chosen at first, and the exact one that of MSSD.
+    at last on the scale of what was chosen at first, and the exact one that of MSSD. Returned is what was asked.
     """
 
     def searches(sources: Sources, network: Any) -> Any:
@@ -64,7 +64,7 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
         return dict.fromkeys(np.unique(poses["object"]).tolist(), int((poses["error"] < 0.1).sum()))
 
     def scale(poses: dict[str, np.ndarray], logits: np.ndarray, fits: FitOptions) -> tuple[float, float]:
-        assert asked == {(5, 2)}
+        assert asked == {(4, 2)}
         np.testing.assert_array_equal(poses["T_camera_object"][:, 0, 3], [2, 3])
         return 1.5, 0.5
 
@@ -72,7 +72,6 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def all_but_the_first(found: Candidates, model: Named, part: Any, config: Any, exact: int) -> Any:
         asked.add(model)
-        assert model in {(5, 2), (5, 2, 1.5, 0.5)}
         assert exact == 2
         assert found.evidence.shape[1] == len(EVIDENCE)
         return SimpleNamespace(kept=np.arange(len(found.usable)) > 0)
@@ -84,6 +83,7 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reported_poses, "averaged", Named)
     monkeypatch.setattr(reported_poses, "scale_of", scale)
     monkeypatch.setattr(reported_poses, "chosen", all_but_the_first)
+    return asked
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def store(path: Path, network: Model, names: tuple[str, ...] = EVIDENCE, **other
         "names": np.array(names),
         "used": np.array(names),
         "evidence": np.tile(np.arange(len(names), dtype=np.float32), (6, 1)),
-        "error": np.full(6, 0.01),
+        "error": np.array([0.01, 0.01, 0.01, 0.5, 0.01, 0.01]),
         "largest_error": np.array([0.01, 0.2, 0.2, 0.2, 0.01, 0.01]),
         "object": np.array([7, 7, 7, 7, 8, 8]),
         "search": np.array([0, 0, 0, 0, 1, 1]),
@@ -118,9 +118,8 @@ def store(path: Path, network: Model, names: tuple[str, ...] = EVIDENCE, **other
 _OF_CROPS = tuple(name for name in EVIDENCE if name not in (*PICTURE_EVIDENCE, VERIFIED))
 
 
-@pytest.mark.usefixtures("searched")
 def test_stored_poses_are_judged_anew_by_other_evidence(
-    tmp_path: Path, network: Model, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, network: Model, monkeypatch: pytest.MonkeyPatch, searched: set[Named]
 ) -> None:
     path, names = tmp_path / "poses.npz", ("what is gone", *reversed(_OF_CROPS))
     store(path, network, names)
@@ -135,6 +134,7 @@ def test_stored_poses_are_judged_anew_by_other_evidence(
         else:
             wanted = np.full(6, names.index(name))
         np.testing.assert_array_equal(column, wanted)
+    assert searched == {(4, 2), (4, 2, 1.5, 0.5)}
     # Of refined poses that detection chooses among, those that are chosen.
     np.testing.assert_array_equal(poses["reported"], [False, False, True, True, False, False])
     with np.load(path) as stored:  # nothing is lost that another day's evidence may want
@@ -190,6 +190,17 @@ def test_stored_poses_that_cannot_be_judged_anew_stay(tmp_path: Path, network: M
             poses_to_fit(anew, FitOptions(), network, path)
 
 
+@pytest.mark.usefixtures("searched")
+def test_poses_that_were_chosen_for_another_share_of_searches_in_vain_are_refused(
+    tmp_path: Path, network: Model
+) -> None:
+    path = tmp_path / "poses.npz"
+    store(path, network)
+    poses_to_fit(Sources(), FitOptions(), network, path)
+    with pytest.raises(InputError, match="holds poses of other bins, weights or settings: remove it"):
+        poses_to_fit(Sources(), FitOptions(in_vain=0.3), network, path)
+
+
 def test_poses_of_other_bins_are_refused(tmp_path: Path) -> None:
     path, output = tmp_path / "poses.npz", tmp_path / "a.json"
     for wrong in ({"made_of": np.array("others")}, {"more": np.zeros(1)}):
@@ -228,7 +239,7 @@ def test_poses_are_chosen_among_as_those_of_a_search(motor: DevicePart) -> None:
     weights = tuple(float(name == "near") for name in EVIDENCE)
     model = Calibration(EVIDENCE, weights, 0.0)
     whole = chosen(found, model, motor, DetectConfig(reported=0.0)).kept
-    choosable = reported_poses.choosable(poses[usable], evidence[usable])
+    choosable = reported_poses._choosable(poses[usable], evidence[usable])
     few = chosen(choosable, model, motor, DetectConfig(reported=0.0)).kept
     np.testing.assert_array_equal(few, whole[usable])
     assert 0 < few.sum() < len(few)
@@ -242,7 +253,7 @@ def test_of_later_turns_detection_sees_what_is_near_an_unsure_pose(motor: Device
     poses[:, 0, 3] = places
     evidence = np.zeros((6, len(EVIDENCE)), dtype=np.float32)
     evidence[:, 0] = odds
-    found = reported_poses.choosable(poses, evidence)
+    found = reported_poses._choosable(poses, evidence)
     kept, due = reported_poses._chosen_in_turns(found, turns, exact, exact, motor)
     assert due.tolist() == [True, False, True, True, False, False]
     assert kept.tolist() == [True, False, False, True, False, False]

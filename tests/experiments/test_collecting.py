@@ -45,7 +45,7 @@ def test_candidates_are_refined_in_the_turns_of_detection(monkeypatch: pytest.Mo
     assert (rows.tolist(), turns.tolist()) == ([0, 2, 1, 3, 4], [0, 0, 1, 1, -1])
     rows, turns = module._turns(found._replace(usable=np.arange(5) == 4), model, part)
     assert (rows.tolist(), turns.tolist()) == ([4], [-1])
-    monkeypatch.setattr(module, "_CONFIG", DetectConfig(next_best=0))
+    monkeypatch.setattr(module, "CONFIG", DetectConfig(next_best=0))
     rows, turns = module._turns(found, model, part)
     assert (rows.tolist(), turns.tolist()) == ([0, 2, 4], [0, 0, -1])
 
@@ -80,8 +80,9 @@ class Asked:
 
             def columns(found: Any, row: int = row, own: int = own) -> dict[str, np.ndarray]:
                 count = int(found.usable.sum())
-                numbers = {"object": 7 + own, "search": row, "error": 0.01, "largest_error": 0.01, "narrowed": False}
+                numbers = {"object": 7 + own, "search": row, "narrowed": False}
                 rows = {name: np.full(count, value) for name, value in numbers.items()}
+                rows |= dict.fromkeys(("error", "largest_error"), np.where(np.arange(count) == 1, 0.5, 0.01))
                 poses = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1))
                 return rows | {"evidence": np.full((count, len(EVIDENCE)), found.evidence[0]), "T_camera_object": poses}
 
@@ -149,7 +150,7 @@ def test_other_forms_of_poses_have_their_turns(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr(module, "refined_candidates", forms)
     monkeypatch.setattr(reported_poses, "_chosen_in_turns", in_turns)
     result = module.collect(Sources(), FitOptions(), network)
-    assert seen == [[0, 1, 0]] * 2  # by models as they come, and by scaled ones
+    assert seen == [[0, 1, 0]]  # of one outcome no scale is known
     assert result["turn"].tolist() == [-1, 0, 1, 0]
     assert result["reported"].tolist() == [False, False, True, False]
     assert result["due"].tolist() == [False, True, True, False]
@@ -228,7 +229,7 @@ def test_a_search_is_explored_as_by_detection(monkeypatch: pytest.MonkeyPatch, m
         "FPFH": ("stranger", "on device", scene, "rows"),
     }
     assert module._explored(search, propose, named["chooser"]) == wanted[method]
-    assert asked == [(scene, "stranger", "chooser", module._CONFIG)]
+    assert asked == [(scene, "stranger", "chooser", module.CONFIG)]
     assert module._first_seeds(search) == (scene, "foreground", "stranger")
 
 

@@ -71,6 +71,16 @@ def test_so_is_it_by_measurements_of_whole_bins_and_comparisons(
         command()
 
 
+def test_probabilities_of_rivals_that_are_of_another_day_name_it_as_well(tmp_path: Path) -> None:
+    old = tmp_path / "fpfh.calibration.json"
+    for content, what in ((None, "has not been made yet"), ("{}", "is not a readable calibration: .*")):
+        if content is not None:
+            old.write_text(content)
+        maker = rf"python -m experiments.calibrate --method FPFH --output {re.escape(str(old))}, or leave FPFH out"
+        with pytest.raises(InputError, match=f"{what}: {maker}"):
+            detect_bins.run(detect_bins.Options(methods=("FPFH",), fpfh_calibration=old))
+
+
 def test_a_benchmark_without_data_is_one_sentence() -> None:
     command = [sys.executable, "-m", "benchmarks.detection", "--folders", "outputs/test_sets/none"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=200)
