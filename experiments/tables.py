@@ -28,9 +28,9 @@ _OTHERS_IN_SHORT = (
     "[other scenes](docs/detect.md#outside-of-these-bins): tables, trays, full bins, mixed parts, other sensors"
 )
 _RELEASED = (
-    "what is released: whole searches, for up to three objects that are not there, told as if for a quarter; after"
-    " that, noisy images averaged, searches that go on among what is found, for poses of 0.1, the next best poses where"
-    " unsure ones stand, and full bins ([results](results/worlds_test.json))"
+    "what is released: fitted to what searches refine and choose today, to full bins and to twelve more families of"
+    " parts, by models of either error together; what is said of poses of one scan by the most probable one, up to log"
+    " odds of 5; of known worlds to `verifier` alone ([results](results/worlds_test.json))"
 )
 _SEARCHES = {
     "fast: one draw": "fast",
