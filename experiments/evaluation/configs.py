@@ -33,7 +33,7 @@ from typing import Literal
 
 import numpy as np
 
-from kmn_jax.errors import InputError
+from kmn_jax.errors import InputError, number_list
 from kmn_jax.released import RELEASED
 
 Source = Literal["bop", "clouds"]
@@ -94,15 +94,7 @@ class EvaluateConfig:
     @property
     def sensor_place(self) -> np.ndarray | None:
         """The sensor's place as numbers."""
-        if self.sensor is None:
-            return None
-        try:
-            place = np.array([float(number) for number in self.sensor.split(",")])
-        except ValueError:
-            place = np.zeros(0)
-        if place.shape != (3,) or not np.isfinite(place).all():
-            raise InputError(f"sensor is {self.sensor!r}, but must be X,Y,Z in the clouds' unit")
-        return place
+        return None if self.sensor is None else np.array(number_list(self.sensor, "sensor", 3))
 
 
 _SETS = Path("outputs/test_sets")
