@@ -24,6 +24,7 @@ from kmn_jax.detection._refinement import refine_many, refine_one
 from kmn_jax.detection._scene import Scene
 from kmn_jax.detection._search import Candidates, SearchConfig, seed_keys
 from kmn_jax.detection._selection import Selection, select_poses
+from kmn_jax.detection._settling import settle
 from kmn_jax.detection._timing import Clock
 from kmn_jax.detection._verification import VERIFIED, verified
 from kmn_jax.programs import compiled_size
@@ -57,7 +58,8 @@ def choose_and_refine(
 
     Refined are the most probable one of each place and a contender; then, once one of the scene is sure, up to
     `config.next_best` times the next one of each place in which an unsure one stands, and in the end those that stand
-    and are unsure once more, from where they are. Without a sure one, a part that is not there would only have more
+    and are unsure once more, from where they are. What then stands is settled against what the part is mistaken for
+    (`settle`). Without a sure one, a part that is not there would only have more
     chances to be mistaken; and of the many places where nothing stands few have one.
     `search` is `config.search` of the network.
     """
@@ -86,11 +88,25 @@ def choose_and_refine(
         best = judged(_together(best.candidates, refined(rows)))
         tried.append(rows)
         unsure, sure = _standing(best, config)
-    if not len(unsure) or not len(sure):
-        return best
     forms = len(best.candidates.usable) // sum(map(len, tried))
-    rows = np.concatenate([np.tile(some, forms) for some in tried])[unsure]  # that they were made of
-    return judged(_together(best.candidates, refined(rows, best.candidates.T_camera_object[unsure])))
+
+    def made_of(rows: Int[np.ndarray, " k"]) -> Int[np.ndarray, " k"]:
+        return np.concatenate([np.tile(some, forms) for some in tried])[rows]
+
+    if len(unsure) and len(sure):
+        rows = made_of(unsure)
+        best = judged(_together(best.candidates, refined(rows, best.candidates.T_camera_object[unsure])))
+        tried.append(rows)
+    with clock("refinement"):
+        stand = np.flatnonzero(best.selection.kept)
+        poses, is_other = settle(best.candidates.T_camera_object[stand], on_device, scene.cloud, scene.image)
+        rows = stand[is_other]
+        if not len(rows):
+            return best
+        there = np.ones((len(rows), 1), dtype=bool)
+        settled = _with_evidence(found, made_of(rows), poses[is_other][:, None], there, on_device, scene, search)
+        fine = _replaced(best.candidates, rows, settled)
+    return Choice(fine, *_probable(best.selection, fine, probabilities, config, scene.is_narrowed))
 
 
 def _standing(choice: Choice, config: DetectConfig) -> tuple[Int[np.ndarray, " u"], Int[np.ndarray, " t"]]:
@@ -176,6 +192,14 @@ def _together(before: Candidates, more: Candidates) -> Candidates:
     return before._replace(**both)
 
 
+def _replaced(candidates: Candidates, rows: Int[np.ndarray, " k"], other: Candidates) -> Candidates:
+    """Return candidates with others of the same crops in some rows."""
+    columns = {name: getattr(candidates, name).copy() for name in ("T_camera_object", "evidence", "num_inliers")}
+    for name, column in columns.items():
+        column[rows] = getattr(other, name)
+    return candidates._replace(**columns)
+
+
 def refined_candidates(
     on_device: DevicePart,
     scene: Scene,
@@ -202,7 +226,19 @@ def refined_candidates(
     )
     poses = np.array(poses)
     poses[there] = polish(poses[there], on_device, scene.image)
-    # The refined forms take the place of the poses of their crops.
+    return _with_evidence(found, rows, poses, there, on_device, scene, config)
+
+
+def _with_evidence(
+    found: Candidates,
+    rows: Int[np.ndarray, " k"],
+    poses: Float32[np.ndarray, "k a 4 4"],
+    there: Bool[np.ndarray, "k a"],
+    on_device: DevicePart,
+    scene: Scene,
+    config: SearchConfig,
+) -> Candidates:
+    """Return forms of some of the candidates, with evidence of their own, which take the place of what is in crops."""
     forms = there.shape[1]
     own = jax.tree.map(
         lambda leaf: np.repeat(leaf.reshape(-1, *leaf.shape[2:])[rows, None], forms, axis=1),
@@ -272,6 +308,13 @@ def reported(
     What is then too improbable leaves its place empty: a rival there would be no surer.
     """
     choice = chosen(refined, probabilities.refined, part, config, probabilities.exact)
+    return _probable(choice, refined, probabilities, config, is_narrowed)
+
+
+def _probable(
+    choice: Selection, of: Candidates, probabilities: Probabilities, config: DetectConfig, is_narrowed: bool
+) -> tuple[Selection, Float[np.ndarray, " s"]]:
+    """Return which of the chosen candidates are probable enough, given each other, and how probable all are."""
     probability = np.zeros(len(choice.kept))
-    probability[choice.kept] = probabilities.of_scene(refined.evidence[choice.kept], is_narrowed)
+    probability[choice.kept] = probabilities.of_scene(of.evidence[choice.kept], is_narrowed)
     return choice._replace(kept=choice.kept & (probability >= config.reported)), probability

@@ -16,6 +16,7 @@ from kmn_jax.simulate._splat import (
     Surfels,
     VisiblePoints,
     bin_surfels,
+    picture_by_splatting,
     visible_by_splatting,
     visible_from_bits,
 )
@@ -58,6 +59,7 @@ __all__ = [
     "make_world",
     "measured",
     "pack_bits",
+    "picture_by_splatting",
     "place_camera",
     "render",
     "rows_of",

@@ -171,6 +171,27 @@ def visible_by_splatting(
     return visible_points_of(len(copies), *parts)
 
 
+def picture_by_splatting(
+    surfels: Surfels,
+    T_camera_object: Pose,
+    points: Points,
+    camera: Intrinsics,
+    config: SplatConfig = SplatConfig(),
+) -> tuple[VisiblePoints, Float[Array, " p"]]:
+    """Return what a camera sees of one object alone, and its depth in the directions of points, infinite beside it."""
+    spacing = jnp.sqrt(surfels.area / surfels.points.shape[0])
+    placed = place_surfels(surfels, T_camera_object[None], jnp.ones(1, dtype=bool))
+    drawn = facing(placed) & _in_image(placed, camera)
+    buffer = draw_discs(placed, drawn, spacing, config.resolution)
+    x, y, z = points.T
+    columns, rows = (jnp.round(pixel) for pixel in _pixels((x, y, z), buffer))
+    size = config.resolution
+    beside = (z <= 0) | (columns < 0) | (columns >= size) | (rows < 0) | (rows >= size)
+    depth = buffer.depth[jnp.where(beside, 0, rows * size + columns).astype(jnp.int32)]
+    visible = visible_points_of(1, (placed, drawn & unhidden(placed, buffer, spacing)))
+    return visible, jnp.where(beside, jnp.inf, depth)
+
+
 class PlacedSurfels(NamedTuple):
     """Surfels in the camera frame, one array per coordinate: sums over an axis of 3 are slow on CPUs."""
 
