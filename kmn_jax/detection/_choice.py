@@ -17,6 +17,7 @@ from kmn_jax.detection._calibration import Calibration, Probabilities
 from kmn_jax.detection._config import DetectConfig
 from kmn_jax.detection._crop_search import CropPoses
 from kmn_jax.detection._device_part import DevicePart
+from kmn_jax.detection._disambiguation import disambiguate
 from kmn_jax.detection._evidence import EVIDENCE, gather_evidence
 from kmn_jax.detection._mapping import call_rows
 from kmn_jax.detection._polish import polish
@@ -24,7 +25,6 @@ from kmn_jax.detection._refinement import refine_many, refine_one
 from kmn_jax.detection._scene import Scene
 from kmn_jax.detection._search import Candidates, SearchConfig, seed_keys
 from kmn_jax.detection._selection import Selection, select_poses
-from kmn_jax.detection._settling import settle
 from kmn_jax.detection._timing import Clock
 from kmn_jax.detection._verification import VERIFIED, verified
 from kmn_jax.programs import compiled_size
@@ -58,10 +58,9 @@ def choose_and_refine(
 
     Refined are the most probable one of each place and a contender; then, once one of the scene is sure, up to
     `config.next_best` times the next one of each place in which an unsure one stands, and in the end those that stand
-    and are unsure once more, from where they are. What then stands is settled against what the part is mistaken for
-    (`settle`). Without a sure one, a part that is not there would only have more
-    chances to be mistaken; and of the many places where nothing stands few have one.
-    `search` is `config.search` of the network.
+    and are unsure once more, from where they are. Without a sure one, a part that is not there would only have more
+    chances to be mistaken; and of the many places where nothing stands few have one. What stands is at last compared
+    with all that the part is mistaken for (`disambiguate`). `search` is `config.search` of the network.
     """
     with clock("selection"):
         first = chosen(found, probabilities.found, on_device, config)
@@ -99,13 +98,13 @@ def choose_and_refine(
         tried.append(rows)
     with clock("refinement"):
         stand = np.flatnonzero(best.selection.kept)
-        poses, is_other = settle(best.candidates.T_camera_object[stand], on_device, scene.cloud, scene.image)
+        poses, is_other = disambiguate(best.candidates.T_camera_object[stand], on_device, scene.cloud, scene.image)
         rows = stand[is_other]
         if not len(rows):
             return best
         there = np.ones((len(rows), 1), dtype=bool)
-        settled = _with_evidence(found, made_of(rows), poses[is_other][:, None], there, on_device, scene, search)
-        fine = _replaced(best.candidates, rows, settled)
+        others = _with_evidence(found, made_of(rows), poses[is_other][:, None], there, on_device, scene, search)
+        fine = _replaced(best.candidates, rows, others)
     return Choice(fine, *_probable(best.selection, fine, probabilities, config, scene.is_narrowed))
 
 

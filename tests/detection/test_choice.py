@@ -102,6 +102,7 @@ def stand(choice: Choice) -> dict[int, float]:
 MOVE = 0.001 * BOX.diameter
 APART = 0.06 * BOX.diameter  # what is so far apart is refined for itself, but is one place
 FAR = 9.0
+SIDEWAYS = np.diag(np.float32([-1, -1, 1, 1]))
 
 
 def test_where_all_become_sure_no_others_are_refined(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,6 +137,35 @@ def test_forms_of_candidates_that_were_refined_later_are_known_by_them(monkeypat
     assert stand(choice) == pytest.approx({2: 0.3, 3: 2.0, 4: 5.0})
     depth = choice.candidates.T_camera_object[choice.selection.kept, 2, 3]
     assert depth.tolist() == pytest.approx([9.0 + MOVE, 9.0 + 2 * MOVE, 9.0 + 3 * MOVE])
+
+
+@pytest.mark.parametrize(("odds", "listed"), [(0.5, {2: 0.3, 3: 0.5, 4: 5.0}), (-20.0, {2: 0.3, 4: 5.0})])
+def test_what_is_taken_for_another_form_has_evidence_of_its_own(
+    monkeypatch: pytest.MonkeyPatch, odds: float, listed: dict[int, float]
+) -> None:
+    """It is known by the candidate that it was made of, and as little reported as any if it is improbable."""
+    found = candidates((0.0, 3.0), (FAR, 2.0), (APART, 0.0), (FAR + APART, -0.5), (-FAR, 4.0))
+    become = {0: [0.0], 1: [0.1], 2: [0.2, 0.3], 3: [0.4, 2.0], 4: [5.0]}
+    made_of: list[int] = []
+
+    def disambiguate(poses: np.ndarray, *_: object) -> tuple[np.ndarray, np.ndarray]:
+        is_other = poses[:, 0, 3] > 8.0
+        return np.where(is_other[:, None, None], poses @ SIDEWAYS, poses), is_other
+
+    def with_evidence(of: Candidates, rows: np.ndarray, poses: np.ndarray, there: np.ndarray, *_: object) -> Candidates:
+        assert there.tolist() == [[True]]
+        made_of.extend(of.num_inliers[rows].tolist())
+        evidence = of.evidence[rows].copy()
+        evidence[:, 1] = odds
+        return Candidates(poses[:, 0], there[:, 0], evidence, of.num_inliers[rows], of.crop[rows], of.found, rows)
+
+    monkeypatch.setattr(choosing, "disambiguate", disambiguate)
+    monkeypatch.setattr(choosing, "_with_evidence", with_evidence)
+    _, choice = refine(monkeypatch, found, become, turned={3: 1.0})
+    assert made_of == [3]
+    assert stand(choice) == pytest.approx(listed)
+    ways = choice.candidates.T_camera_object[choice.selection.kept, 0, 0]
+    assert sorted(ways.tolist()) == [-1.0] * (3 in listed) + [1.0, 1.0]
 
 
 def test_what_would_become_the_same_pose_or_is_hardly_probable_is_not_refined(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kmn_jax.detection import Scene, make_scene
-from kmn_jax.detection._settling import _settle_many, settle, settle_one
+from kmn_jax.detection._disambiguation import _disambiguate_many, disambiguate, disambiguate_one
 from kmn_jax.geometry import measured_points, pad_cloud
 from kmn_jax.io import Scan
 from kmn_jax.objects import Part
@@ -37,12 +37,12 @@ def scene() -> Scene:
 
 
 @pytest.mark.parametrize("share", [1.0, 0.1])
-def test_a_pose_the_wrong_way_round_is_settled(part: Part, share: float) -> None:
+def test_a_pose_the_wrong_way_round_is_told(part: Part, share: float) -> None:
     turns, is_rival = turns_of(part)
     shown = before_a_wall(share)
     true = TRUE.astype(np.float32)
     starts = np.stack([true, *(TRUE @ np.linalg.inv(turn) for turn in turns[is_rival])]).astype(np.float32)
-    found, is_other = settle(starts, device_of(part, is_rival), shown.cloud, shown.image)
+    found, is_other = disambiguate(starts, device_of(part, is_rival), shown.cloud, shown.image)
     np.testing.assert_array_equal(found[0], true)
     assert is_other.tolist() == [False] + [True] * (len(starts) - 1)
     apart = [float(mssd(pose, true, part.points[:300])) for pose in found]
@@ -60,20 +60,24 @@ def test_what_nothing_speaks_against_stays(part: Part, scene: Scene) -> None:
         (start, is_rival, nothing),
         (behind, is_rival, (scene.cloud, scene.image)),
     ):
-        found, is_other = settle_one(pose, device_of(part, rivals), cloud, image)
+        found, is_other = disambiguate_one(pose, device_of(part, rivals), cloud, image)
         np.testing.assert_array_equal(found, pose)
         assert not is_other
-    unchanged, others = settle(start[None], device_of(part), scene.cloud, scene.image)
+    unchanged, others = disambiguate(start[None], device_of(part), scene.cloud, scene.image)
     np.testing.assert_array_equal(unchanged, start[None])
     assert not others.any()
-    assert settle(start[:0].reshape(0, 4, 4), device_of(part, is_rival), scene.cloud, scene.image)[0].shape == (0, 4, 4)
+    assert disambiguate(start[:0].reshape(0, 4, 4), device_of(part, is_rival), scene.cloud, scene.image)[0].shape == (
+        0,
+        4,
+        4,
+    )
 
 
-def test_many_are_settled_as_each_is(part: Part, scene: Scene) -> None:
+def test_many_are_told_as_each_is(part: Part, scene: Scene) -> None:
     turns, is_rival = turns_of(part)
     starts = np.stack([TRUE, TRUE @ np.linalg.inv(turns[0])]).astype(np.float32)
     given = device_of(part, is_rival), scene.cloud, scene.image
-    found, others = settle(starts, *given)
-    many, which = _settle_many(starts, *given)
+    found, others = disambiguate(starts, *given)
+    many, which = _disambiguate_many(starts, *given)
     assert others.tolist() == np.asarray(which).tolist() == [False, True]
     np.testing.assert_allclose(many, found, atol=1e-4 * part.diameter)

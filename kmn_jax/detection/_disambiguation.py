@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Float32, Int
 
 from kmn_jax.detection._depth_agreement import DepthImage, measured_at
 from kmn_jax.detection._device_part import DevicePart
-from kmn_jax.detection._mapping import call_rows, map_real
+from kmn_jax.detection._mapping import call_rows, map_real, map_rows
 from kmn_jax.detection._polish import polished
 from kmn_jax.geometry import PaddedCloud, compose, rotate_vectors, smallest_at, spread_rows, transform_points
 from kmn_jax.programs import kept
@@ -27,6 +27,7 @@ from kmn_jax.typing import Pose, Scalar
 _SIGHT = SplatConfig(resolution=128)  # of the part alone
 _POINTS = 2048  # measured ones, in directions in which the part may be
 _MOVED = 6  # turned forms that are moved onto what was measured, those that agree best as they are
+_ROUNDS = 2  # of moving
 _SLACK = 0.3  # by which such a one may agree less than the pose itself
 _GATE = 0.05  # diameters, between the surface and what was measured of it
 _SPREADS, _LEAST_TOLERANCE = 3, 0.02  # medians of the distances; diameters
@@ -43,7 +44,7 @@ class _Sight(NamedTuple):
     area: Float[Array, " m"]  # of it in the picture; zero where it is hidden or nothing was measured
 
 
-def settled(pose: Pose, part: DevicePart, cloud: PaddedCloud, image: DepthImage) -> tuple[Pose, Bool[Array, ""]]:
+def disambiguated(pose: Pose, part: DevicePart, cloud: PaddedCloud, image: DepthImage) -> tuple[Pose, Bool[Array, ""]]:
     """Return the form of a pose T_camera_object that what was measured clearly prefers, and whether it is another one.
 
     The other forms are those that the part is mistaken for, `DevicePart.turns`. The pose itself is returned as it is,
@@ -66,33 +67,34 @@ def settled(pose: Pose, part: DevicePart, cloud: PaddedCloud, image: DepthImage)
             jnp.where(there, seen.picture_area, 0),
         )
 
-    own = sight(polished(pose, part, image))
-    expected = jnp.maximum(jnp.isfinite(own.gap).sum(dtype=jnp.float32), 1)
-    middle = smallest_at(jnp.where(own.near, jnp.abs(own.apart), jnp.inf), own.near.sum(dtype=jnp.int32) // 2)
+    def moved(start: Pose) -> tuple[Pose, _Sight]:
+        end = jax.lax.fori_loop(0, _ROUNDS, lambda _, pose: polished(pose, part, image), start)
+        return end, sight(end)
+
+    starts = jnp.concatenate([pose[None], map_rows(lambda turn: compose(pose, turn), part.turns)])
+    hope = _agreements(map_real(sight, _after_itself(part.is_rival), starts), jnp.float32(_GATE))
+    hope, rows = jax.lax.top_k(jnp.where(part.is_rival & (hope[1:] >= hope[0] - _SLACK), hope[1:], -jnp.inf), _MOVED)
+    there = _after_itself(jnp.isfinite(hope))
+    forms, sights = map_real(moved, there, jnp.concatenate([pose[None], starts[1:][rows]]))
+    distance = jnp.where(sights.near[0], jnp.abs(sights.apart[0]), jnp.inf)
+    middle = smallest_at(distance, sights.near[0].sum(dtype=jnp.int32) // 2)
     tolerance = jnp.clip(_SPREADS * jnp.where(jnp.isfinite(middle), middle, 0), _LEAST_TOLERANCE, _GATE)
-
-    def agreement(of: _Sight, tolerance: Scalar | float) -> Scalar:
-        """Return which share of the points that belong to the pose itself is explained, less that seen through."""
-        explained = jnp.maximum(1 - (of.gap / tolerance) ** 2, 0).sum() / expected
-        area = jnp.maximum(of.area.sum(), jnp.finfo(jnp.float32).tiny)
-        return explained - jnp.where(of.behind >= 2 * tolerance, of.area, 0).sum() / area
-
-    def rough(turn: Pose) -> tuple[Pose, Scalar]:
-        turned = compose(pose, turn)
-        return turned, agreement(sight(turned), _GATE)
-
-    def fine(turned: Pose) -> tuple[Pose, Scalar]:
-        moved = polished(polished(turned, part, image), part, image)
-        return moved, agreement(sight(moved), tolerance)
-
-    turned, hope = map_real(rough, part.is_rival, part.turns)
-    is_hopeful = part.is_rival & (hope >= agreement(own, _GATE) - _SLACK)
-    hope, rows = jax.lax.top_k(jnp.where(is_hopeful, hope, -jnp.inf), _MOVED)
-    forms, found = map_real(fine, jnp.isfinite(hope), turned[rows])
-    found = jnp.where(jnp.isfinite(hope), found, -jnp.inf)
+    found = jnp.where(there, _agreements(sights, tolerance), -jnp.inf).at[0].add(_MARGIN)
     best: Int[Array, ""] = found.argmax()
-    is_other = found[best] > agreement(own, tolerance) + _MARGIN
-    return jnp.where(is_other, forms[best], pose), is_other
+    return jnp.where(best > 0, forms[best], pose), best > 0
+
+
+def _agreements(of: _Sight, tolerance: Scalar) -> Float[Array, " a"]:
+    """Return which share of the first form's own points each explains, less the share of it that was seen through."""
+    expected = jnp.maximum(jnp.isfinite(of.gap[0]).sum(dtype=jnp.float32), 1)
+    explained = jnp.maximum(1 - (of.gap / tolerance) ** 2, 0).sum(axis=1) / expected
+    area = jnp.maximum(of.area.sum(axis=1), jnp.finfo(jnp.float32).tiny)
+    return explained - jnp.where(of.behind >= 2 * tolerance, of.area, 0).sum(axis=1) / area
+
+
+def _after_itself(others: Bool[Array, " a"]) -> Bool[Array, " b"]:
+    """Return flags of forms of a pose after that of the pose itself."""
+    return jnp.concatenate([jnp.ones(1, dtype=bool), others])
 
 
 def _in_directions_of(pose: Pose, part: DevicePart, cloud: PaddedCloud) -> PaddedCloud:
@@ -107,17 +109,19 @@ def _in_directions_of(pose: Pose, part: DevicePart, cloud: PaddedCloud) -> Padde
     return PaddedCloud(cloud.points[rows], there)
 
 
-settle_one = kept()(settled)
+disambiguate_one = kept()(disambiguated)
 
 
-_settle_many = jax.jit(jax.vmap(settled, in_axes=(0, None, None, None)))
+_disambiguate_many = jax.jit(jax.vmap(disambiguated, in_axes=(0, None, None, None)))
 
 
-def settle(
+def disambiguate(
     T_camera_object: Float32[np.ndarray, "k 4 4"], part: DevicePart, cloud: PaddedCloud, image: DepthImage
 ) -> tuple[Float32[np.ndarray, "k 4 4"], Bool[np.ndarray, " k"]]:
-    """Return what `settled` does of poses."""
+    """Return what `disambiguated` does of poses."""
     if not len(T_camera_object) or not np.asarray(part.is_rival).any():
         return T_camera_object, np.zeros(len(T_camera_object), dtype=bool)
     given = part, cloud, image
-    return call_rows(lambda pose: settle_one(pose, *given), lambda poses: _settle_many(poses, *given), T_camera_object)
+    return call_rows(
+        lambda pose: disambiguate_one(pose, *given), lambda poses: _disambiguate_many(poses, *given), T_camera_object
+    )
