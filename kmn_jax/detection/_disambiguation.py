@@ -21,14 +21,15 @@ from kmn_jax.detection._mapping import call_rows, map_real, map_rows
 from kmn_jax.detection._polish import polished
 from kmn_jax.geometry import PaddedCloud, compose, rotate_vectors, smallest_at, spread_rows, transform_points
 from kmn_jax.programs import kept
-from kmn_jax.simulate import SplatConfig, picture_by_splatting
+from kmn_jax.simulate import SplatConfig, Surfels, picture_by_splatting
 from kmn_jax.typing import Pose, Scalar
 
-_SIGHT = SplatConfig(resolution=128)  # of the part alone
+_SIGHT, _ROUGH_SIGHT = SplatConfig(resolution=128), SplatConfig(resolution=64)  # of the part alone
 _POINTS = 2048  # measured ones, in directions in which the part may be
-_MOVED = 6  # turned forms that are moved onto what was measured, those that agree best as they are
+_ROUGH_SURFELS, _ROUGH_SHARE = 512, 4  # of the part, and one measured point in so many: for forms as they are
+_MOVED = 4  # turned forms that are moved onto what was measured, those that agree best as they are
 _ROUNDS = 2  # of moving
-_SLACK = 0.3  # by which such a one may agree less than the pose itself
+_SLACK = 0.2  # by which such a one may agree less than the pose itself
 _GATE = 0.05  # diameters, between the surface and what was measured of it
 _SPREADS, _LEAST_TOLERANCE = 3, 0.02  # medians of the distances; diameters
 _MARGIN = 0.01  # by which another form has to agree better
@@ -52,9 +53,11 @@ def disambiguated(pose: Pose, part: DevicePart, cloud: PaddedCloud, image: Depth
     """
     surfels, diameter = part.surfels, part.arrays.diameter
     measured = _in_directions_of(pose, part, cloud)
+    few = Surfels(surfels.points[:_ROUGH_SURFELS], surfels.normals[:_ROUGH_SURFELS], surfels.area)
+    some = PaddedCloud(measured.points[::_ROUGH_SHARE], measured.mask[::_ROUGH_SHARE])
 
-    def sight(pose: Pose) -> _Sight:
-        seen, depth = picture_by_splatting(surfels, pose, measured.points, image.camera, _SIGHT)
+    def sight(pose: Pose, surfels: Surfels, measured: PaddedCloud, config: SplatConfig) -> _Sight:
+        seen, depth = picture_by_splatting(surfels, pose, measured.points, image.camera, config)
         points = transform_points(pose, surfels.points)
         places, there = measured_at(image, points)
         apart = (points - places) / diameter
@@ -69,10 +72,13 @@ def disambiguated(pose: Pose, part: DevicePart, cloud: PaddedCloud, image: Depth
 
     def moved(start: Pose) -> tuple[Pose, _Sight]:
         end = jax.lax.fori_loop(0, _ROUNDS, lambda _, pose: polished(pose, part, image), start)
-        return end, sight(end)
+        return end, sight(end, surfels, measured, _SIGHT)
+
+    def roughly(start: Pose) -> _Sight:
+        return sight(start, few, some, _ROUGH_SIGHT)
 
     starts = jnp.concatenate([pose[None], map_rows(lambda turn: compose(pose, turn), part.turns)])
-    hope = _agreements(map_real(sight, _after_itself(part.is_rival), starts), jnp.float32(_GATE))
+    hope = _agreements(map_real(roughly, _after_itself(part.is_rival), starts), jnp.float32(_GATE))
     hope, rows = jax.lax.top_k(jnp.where(part.is_rival & (hope[1:] >= hope[0] - _SLACK), hope[1:], -jnp.inf), _MOVED)
     there = _after_itself(jnp.isfinite(hope))
     forms, sights = map_real(moved, there, jnp.concatenate([pose[None], starts[1:][rows]]))
