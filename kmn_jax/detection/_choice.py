@@ -102,8 +102,10 @@ def choose_and_refine(
         rows = stand[is_other]
         if not len(rows):
             return best
-        there = np.ones((len(rows), 1), dtype=bool)
-        others = _with_evidence(found, made_of(rows), poses[is_other][:, None], there, on_device, scene, search)
+        # In as many forms as before, of which there is the first: for those the evidence is compiled.
+        other = np.repeat(poses[is_other][:, None], forms, axis=1)
+        there = np.tile(np.arange(forms) == 0, (len(rows), 1))
+        others = _with_evidence(found, made_of(rows), other, there, on_device, scene, search)
         fine = _replaced(best.candidates, rows, others)
     return Choice(fine, *_probable(best.selection, fine, probabilities, config, scene.is_narrowed))
 
@@ -192,10 +194,10 @@ def _together(before: Candidates, more: Candidates) -> Candidates:
 
 
 def _replaced(candidates: Candidates, rows: Int[np.ndarray, " k"], other: Candidates) -> Candidates:
-    """Return candidates with others of the same crops in some rows."""
+    """Return candidates with others, the first ones, of the same crops in some rows."""
     columns = {name: getattr(candidates, name).copy() for name in ("T_camera_object", "evidence", "num_inliers")}
     for name, column in columns.items():
-        column[rows] = getattr(other, name)
+        column[rows] = getattr(other, name)[: len(rows)]
     return candidates._replace(**columns)
 
 

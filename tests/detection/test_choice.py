@@ -153,7 +153,7 @@ def test_what_is_taken_for_another_form_has_evidence_of_its_own(
         return np.where(is_other[:, None, None], poses @ SIDEWAYS, poses), is_other
 
     def with_evidence(of: Candidates, rows: np.ndarray, poses: np.ndarray, there: np.ndarray, *_: object) -> Candidates:
-        assert there.tolist() == [[True]]
+        assert there.tolist() == [[True, False]]
         made_of.extend(of.num_inliers[rows].tolist())
         evidence = of.evidence[rows].copy()
         evidence[:, 1] = odds

@@ -22,7 +22,7 @@ from kmn_jax.objects._symmetry import rotation_about
 from kmn_jax.pose import mssd
 from kmn_jax.simulate import RayMesh, Surfels, render, visible_by_splatting
 from tests.reference.meshes import Mesh, camera_scene, notched_box, pose, random_rotations, tube
-from tests.reference.parts import box_part
+from tests.reference.parts import box_part, part_of
 
 CAMERA = Camera(500.0, 500.0, 159.5, 119.5, 320, 240)
 TRUE = pose((0.05, -0.02, 3.0), random_rotations(1, 5)[0])
@@ -39,21 +39,7 @@ def part() -> Part:
 
 
 def of_mesh(mesh: Mesh) -> Part:
-    found = object_from_mesh("part", *mesh, "m", ObjectConfig(num_points=2048))
-    return Part(
-        "part",
-        "m",
-        found.points.astype(np.float32),
-        found.normals.astype(np.float32),
-        np.zeros((8, 4), np.float32),
-        found.diameter,
-        found.minimum,
-        found.maximum,
-        found.area,
-        found.symmetries,
-        "",
-        "",
-    )
+    return part_of(object_from_mesh("part", *mesh, "m", ObjectConfig(num_points=2048)))
 
 
 def turns_of(part: Part) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""A part without a network: a box, whose poses can be checked by hand."""
+"""Parts without a network: a box, whose poses can be checked by hand, and any object."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from kmn_jax.detection import DevicePart, same_place, symmetry_transforms
-from kmn_jax.objects import Part, PartArrays, Symmetries
+from kmn_jax.objects import ObjectModel, Part, PartArrays, Symmetries
 from kmn_jax.simulate import Surfels
 
 HALF = np.array([1.0, 0.5, 0.5])
@@ -41,6 +41,24 @@ def box_part(
         symmetries=symmetries,
         source_digest="",
         model_digest="",
+    )
+
+
+def part_of(model: ObjectModel) -> Part:
+    """Return an object as a part."""
+    return Part(
+        model.name,
+        model.unit,
+        model.points.astype(np.float32),
+        model.normals.astype(np.float32),
+        np.zeros((8, 4), np.float32),
+        model.diameter,
+        model.minimum,
+        model.maximum,
+        model.area,
+        model.symmetries,
+        "",
+        "",
     )
 
 
