@@ -107,7 +107,8 @@ def choose_and_refine(
         there = np.tile(np.arange(forms) == 0, (len(rows), 1))
         others = _with_evidence(found, made_of(rows), other, there, on_device, scene, search)
         fine = _replaced(best.candidates, rows, others)
-    return Choice(fine, *_probable(best.selection, fine, probabilities, config, scene.is_narrowed))
+    with clock("selection"):
+        return Choice(fine, *_probable(best.selection, fine, probabilities, config, scene.is_narrowed))
 
 
 def _standing(choice: Choice, config: DetectConfig) -> tuple[Int[np.ndarray, " u"], Int[np.ndarray, " t"]]:

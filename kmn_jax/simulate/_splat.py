@@ -184,12 +184,8 @@ def picture_by_splatting(
     drawn = facing(placed) & _in_image(placed, camera)
     buffer = draw_discs(placed, drawn, spacing, config.resolution)
     x, y, z = points.T
-    columns, rows = (jnp.round(pixel) for pixel in _pixels((x, y, z), buffer))
-    size = config.resolution
-    beside = (z <= 0) | (columns < 0) | (columns >= size) | (rows < 0) | (rows >= size)
-    depth = buffer.depth[jnp.where(beside, 0, rows * size + columns).astype(jnp.int32)]
     visible = visible_points_of(1, (placed, drawn & unhidden(placed, buffer, spacing)))
-    return visible, jnp.where(beside, jnp.inf, depth)
+    return visible, jnp.where(z > 0, _depth_towards((x, y, z), buffer), jnp.inf)
 
 
 class PlacedSurfels(NamedTuple):
@@ -310,12 +306,20 @@ def draw_discs(placed: PlacedSurfels, drawn: Mask, spacing: Float[Array, "*rows"
 
 def unhidden(placed: PlacedSurfels, buffer: DepthBuffer, spacing: Float[Array, "*rows"]) -> Bool[Array, " r"]:
     """Tell which points that face the camera are, lifted off their surface, at most the tolerance behind the buffer."""
-    size, lift = math.isqrt(len(buffer.depth)), _LIFT * spacing
+    lift = _LIFT * spacing
     x, y, z = (place + lift * normal for place, normal in zip(placed.points, placed.normals, strict=True))
-    columns, rows = (jnp.round(pixel) for pixel in _pixels((x, y, z), buffer))
+    return z <= _depth_towards((x, y, z), buffer) + _TOLERANCE * spacing
+
+
+def _depth_towards(
+    points: tuple[Float[Array, " r"], Float[Array, " r"], Float[Array, " r"]], buffer: DepthBuffer
+) -> Float[Array, " r"]:
+    """Return the depth that was drawn in the directions of points, infinite outside of the buffer too."""
+    size = math.isqrt(len(buffer.depth))
+    columns, rows = (jnp.round(pixel) for pixel in _pixels(points, buffer))
     outside = (columns < 0) | (columns >= size) | (rows < 0) | (rows >= size)
     depth = buffer.depth[jnp.where(outside, 0, rows * size + columns).astype(jnp.int32)]
-    return outside | (z <= depth + _TOLERANCE * spacing)
+    return jnp.where(outside, jnp.inf, depth)
 
 
 def _pixels(

@@ -66,11 +66,8 @@ def test_what_nothing_speaks_against_stays(part: Part, scene: Scene) -> None:
     unchanged, others = disambiguate(start[None], device_of(part), scene.cloud, scene.image)
     np.testing.assert_array_equal(unchanged, start[None])
     assert not others.any()
-    assert disambiguate(start[:0].reshape(0, 4, 4), device_of(part, is_rival), scene.cloud, scene.image)[0].shape == (
-        0,
-        4,
-        4,
-    )
+    none, _ = disambiguate(start[None][:0], device_of(part, is_rival), scene.cloud, scene.image)
+    assert none.shape == (0, 4, 4)
 
 
 def test_many_are_told_as_each_is(part: Part, scene: Scene) -> None:
